@@ -33,6 +33,7 @@ from seaopt.plants.friction import can_stick, let_stick, list_smoothing
 from seaopt.plants.motor.thermal import list_guessed_heat
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore
+from seaopt.simulation import keep_passes
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import unit_after
 
@@ -135,12 +136,13 @@ def fit(
     searching("looking for a start", 0.0)
     callback = _count_iterations(searching)
     before = count_evaluations()
-    solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
-    evaluations = count_evaluations() - before
-    result = summarise(solved, chosen, diagnostics, started)
-    if diagnostics:
-        judged = judge(result, alternatives, judging, validation, evaluations=evaluations)
-        result = _name_guesses(judged, named, params)
+    with keep_passes():
+        solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
+        evaluations = count_evaluations() - before
+        result = summarise(solved, chosen, diagnostics, started)
+        if diagnostics:
+            judged = judge(result, alternatives, judging, validation, evaluations=evaluations)
+            result = _name_guesses(judged, named, params)
     if sharp:
         result = replace(result, findings=order_findings((*result.findings, *map(find_sharp_friction, sharp))))
     progress(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}", 1.0)

@@ -12,7 +12,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 
 from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
@@ -27,14 +27,17 @@ FORGOTTEN = 1e-24  # of a state, in any units: far below rounding
 LOSSES = ("square", "huber", "soft_l1")
 
 
+_INFLUENCES = (
+    (np.int64, ("lags", "parts", "outputs_of", "columns_in")),
+    (np.uint64, ("into", "correlation", "ring", "form")),
+)
 _FIELDS = (  # of seaopt_pass_args behind its channels; pointers are whole numbers
     (np.int64, ("from", "to", "length", "lead", "shared", "drift_terms", "v_columns", "lag_a", "lag_b", "lag_c")),
     (np.int64, ("settle", "start", "output_rows", "sections", "loss", "warm")),
     (np.float64, ("t0", "tau0", "dtau")),
     (np.uint64, ("model", "correction", "x0", "offset", "gain", "drift", "sos", "knee", "gram", "rho", "count")),
     (np.uint64, ("outputs", "columns", "states", "carry")),
-    (np.int64, ("lags", "parts", "outputs_of", "columns_in")),  # and of the influences in it
-    (np.uint64, ("into", "correlation", "ring", "form")),
+    *_INFLUENCES,  # in it
 )
 
 
@@ -138,13 +141,61 @@ def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int,
 def load_passes(model: Model, layout: Layout, delayed: int, *, measured: bool) -> Kernel | None:
     """Return the compiled passes of a model, or None where there is no compiler."""
     kernel = load_kernel(kernel_source(model, layout, delayed, measured=measured), "seaopt_passes")
-    sums = load_library(_text("sums.h") + _text("sums.c"), "seaopt_sums")
+    sums = _load_sums()
     if kernel is None or sums is None:
         return None
     table = ctypes.c_char.in_dll(sums, "seaopt_sums")
     ctypes.c_void_p.in_dll(kernel.library, "sums").value = ctypes.addressof(table)
     kernel.library.carry_size.restype = ctypes.c_long
     return kernel
+
+
+def _load_sums() -> ctypes.CDLL | None:
+    return load_library(_text("sums.h") + _text("sums.c"), "seaopt_sums")
+
+
+def double_sum_of_columns(
+    columns: Float[np.ndarray, "n ny nc"],
+    counted: Bool[np.ndarray, "n ny"],
+    into: Float[np.ndarray, "ny p nc"],
+    r: Float[np.ndarray, "lags1 ny ny"],
+) -> Float[np.ndarray, "2 p p"] | None:
+    """Return what `Program.double_sum` does, of columns that are there."""
+    sums = _load_sums()
+    if sums is None:
+        return None
+    arguments, buffers, form = _lay_out_influences(
+        into, r, np.zeros(1, dtype=[(n, k) for k, ns in _INFLUENCES for n in ns])
+    )
+    chosen, v = np.ascontiguousarray(counted, dtype=np.int32), np.ascontiguousarray(columns)
+    pointers = (ctypes.c_void_p(array.ctypes.data) for array in (arguments, v, chosen))
+    sums.seaopt_sum_twice(*pointers, ctypes.c_long(len(v)))
+    del buffers
+    return _halve_form(form, into.shape[1])
+
+
+def _lay_out_influences(into: Any, r: Any, arguments: Any) -> tuple[Any, Any, Any]:
+    """Return arguments with the influences in them, the memory that they point to, and what is summed, by argument."""
+    ny, p, nc = into.shape
+    width = _pad_to_vectors(p)
+    padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")
+    padded[:, :, :p] = into.transpose(0, 2, 1)
+    halved[0] *= 0.5
+    ring, form = np.zeros((len(arguments), 2 * len(r), ny, width)), np.zeros((len(arguments), 2, width, width))
+    arguments["lags"], arguments["parts"], arguments["outputs_of"], arguments["columns_in"] = (
+        len(r) - 1,
+        width // 4,
+        ny,
+        nc,
+    )
+    arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
+    arguments["ring"], arguments["form"] = row_addresses(ring), row_addresses(form)
+    return arguments, (padded, halved, ring, form), form
+
+
+def _halve_form(form: Any, p: int) -> Float[np.ndarray, "2 p p"]:
+    total = np.sum(form, axis=0)
+    return (total + total.transpose(0, 2, 1))[:, :p, :p]
 
 
 def _pad_to_vectors(count: int) -> int:
@@ -288,22 +339,11 @@ class Program:
         self, x0: Float[np.ndarray, " nx"], into: Float[np.ndarray, "ny p nc"], r: Float[np.ndarray, "lags1 ny ny"]
     ) -> Float[np.ndarray, "2 p p"]:
         """Return the sum over t, s of a(t)' R(t - s) a(s), and its part t = s; a: influences that count into v."""
-        ny, p, nc = into.shape
-        width = _pad_to_vectors(p)
-        padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")
-        padded[:, :, :p] = into.transpose(0, 2, 1)
-        halved[0] *= 0.5
         edges, starts, warm = self._split(0, self.segment.n, x0, halve=True)
         warm[1:] += len(r)  # influences reach so far back
-        ring, form = np.zeros((len(warm), 2 * len(r), ny, width)), np.zeros((len(warm), 2, width, width))
-        arguments = self._place(edges, warm, x0=starts, ring=ring, form=form)
-        arguments["lags"], arguments["parts"] = len(r) - 1, width // 4
-        arguments["outputs_of"], arguments["columns_in"] = ny, nc
-        arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
-        buffers = (self.memory, padded, halved, starts, ring, form)
-        self.kernel.run(arguments, buffers, parallel=self.segment.n >= PARALLEL)
-        total = np.sum(form, axis=0)
-        return (total + total.transpose(0, 2, 1))[:, :p, :p]
+        arguments, influences, form = _lay_out_influences(into, r, self._place(edges, warm, x0=starts))
+        self.kernel.run(arguments, (self.memory, starts, influences), parallel=self.segment.n >= PARALLEL)
+        return _halve_form(form, into.shape[1])
 
     def _place(self, edges: Any, warm: Any, **rows: Any) -> Shaped[np.ndarray, " parts"]:
         """Return the arguments of parts between edges, each with its own row of the arrays."""

@@ -2,19 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.simulation.compiled import Program
+from seaopt.simulation.compiled import Program, double_sum_of_columns
 from seaopt.simulation.discretisation import check_period
 from seaopt.simulation.interpreted import interpret_pass
 from seaopt.simulation.model import Model
 from seaopt.simulation.passes import Pass, Point, Segment, Weights
 
 STREAM_SAMPLES = 1 << 16  # of a stream that are in memory at a time
+KEPT_BYTES = 1 << 26  # of the passes that are kept at a time
+
+
+class _Kept:
+    """The last passes, as many as there is room for, with the models and segments that their keys name by identity."""
+
+    def __init__(self) -> None:
+        self._passes: dict[Any, tuple[Pass, Model, Segment]] = {}
+        self._bytes = 0
+
+    def find(self, key: Any, rows: int, *, columns: bool) -> Pass | None:
+        """Return a pass that has the outputs of so many samples, and columns if wanted."""
+        result = self._passes[key][0] if key in self._passes else None
+        if result is None or (rows and (result.outputs is None or len(result.outputs) < rows)):
+            return None
+        return None if columns and result.columns is None else result
+
+    def add(self, key: Any, result: Pass, model: Model, segment: Segment) -> None:
+        """Keep a pass, and fewer of the older ones."""
+        for array in (result.outputs, result.columns):
+            if array is not None:
+                array.flags.writeable = False
+        self._drop(key)
+        self._passes[key] = result, model, segment
+        self._bytes += _measure_bytes(result)
+        while self._bytes > KEPT_BYTES:
+            self._drop(next(iter(self._passes)))
+
+    def _drop(self, key: Any) -> None:
+        if key in self._passes:
+            self._bytes -= _measure_bytes(self._passes.pop(key)[0])
+
+
+_kept: ContextVar[_Kept | None] = ContextVar("kept", default=None)
+
+
+@contextmanager
+def keep_passes() -> Generator[None]:
+    """Keep passes meanwhile: what is asked of them again is not simulated again."""
+    token = _kept.set(_Kept())
+    try:
+        yield
+    finally:
+        _kept.reset(token)
+
+
+def measure_room() -> int:
+    """Return how many bytes of passes with all their columns may be kept: for two of their kind; 0 if none are."""
+    return 0 if _kept.get() is None else KEPT_BYTES // 2
+
+
+def _measure_bytes(result: Pass) -> int:
+    return result.gram.nbytes + sum(array.nbytes for array in (result.outputs, result.columns) if array is not None)
+
+
+def _key(model: Model, segment: Segment, point: Point, x0: Float[np.ndarray, " nx"], weights: Weights) -> Any:
+    """Return what tells passes apart; models and segments are told by their identity, for they are kept as well."""
+    arrays = (point.theta, point.offset, point.gain, point.drift, point.correction, x0, weights.sections, weights.knee)
+    numbers = tuple(None if array is None else array.tobytes() for array in arrays)
+    return id(model), id(segment), point.clock, point.substeps, weights.settle, weights.loss, numbers
 
 
 def run_passes(
@@ -30,6 +93,7 @@ def run_passes(
     output_rows: int | None = None,
     columns: bool = False,
     states: bool = False,
+    keep: bool = False,
 ) -> Pass:
     """Run a segment, or its first samples, from a state.
 
@@ -48,6 +112,8 @@ def run_passes(
         Keep the model outputs, the residuals with their derivatives, the state trajectory.
     output_rows : int, optional
         Keep the outputs of so many first samples only.
+    keep : bool
+        Make all of the whole segment, for whoever asks for it later within `keep_passes`.
 
     Returns
     -------
@@ -57,19 +123,39 @@ def run_passes(
     check_period(model, point.clock)
     chosen = weights if weights is not None else Weights.plain(model.ny)
     last = segment.n if stop is None else stop
-    program = Program.make(model, segment, point, chosen)
-    if program is not None:
-        return program.run(
-            0, last, x0, sums=sums, outputs=outputs, output_rows=output_rows, columns=columns, states=states
-        )
-    result = interpret_pass(model, segment, point, chosen, last, x0)
-    assert result.outputs is not None
+    rows = (last if output_rows is None else min(output_rows, last)) if outputs else 0
+    kept = _kept.get() if sums and last == segment.n and not states else None
+    key = _key(model, segment, point, x0, chosen) if kept is not None else None
+    result = kept.find(key, rows, columns=columns or keep) if kept is not None else None
+    if result is None:
+        keep = keep and kept is not None
+        result = _run(model, segment, point, chosen, last, x0, sums, last if keep else rows, columns or keep, states)
+        if kept is not None:
+            kept.add(key, result, model, segment)
     return replace(
         result,
-        outputs=result.outputs[:output_rows] if outputs else None,
+        outputs=None if result.outputs is None or not outputs else result.outputs[:rows],
         columns=result.columns if columns else None,
         states=result.states if states else None,
     )
+
+
+def _run(
+    model: Model,
+    segment: Segment,
+    point: Point,
+    weights: Weights,
+    last: int,
+    x0: Float[np.ndarray, " nx"],
+    sums: bool,
+    rows: int,
+    columns: bool,
+    states: bool,
+) -> Pass:
+    program = Program.make(model, segment, point, weights)
+    if program is None:
+        return interpret_pass(model, segment, point, weights, last, x0)
+    return program.run(0, last, x0, sums=sums, outputs=rows > 0, output_rows=rows, columns=columns, states=states)
 
 
 def stream(
@@ -87,9 +173,11 @@ def stream(
     A chunk's arrays are written over by the next. There are no sums.
     """
     chosen = weights if weights is not None else Weights.plain(model.ny)
-    program = Program.make(model, segment, point, chosen)
+    store = _kept.get()
+    kept = store and store.find(_key(model, segment, point, x0, chosen), segment.n, columns=columns)
+    program = None if kept else Program.make(model, segment, point, chosen)
     if program is None:
-        whole = interpret_pass(model, segment, point, chosen, segment.n, x0)
+        whole = kept or interpret_pass(model, segment, point, chosen, segment.n, x0)
         assert whole.outputs is not None
         for start in range(0, segment.n, chunk):
             rows = slice(start, start + chunk)
@@ -125,5 +213,13 @@ def double_sum(
     r : array, shape (lags + 1, ny, ny)
         R(k)[a, b] of output a with output b so many samples before; R(-k) = R(k)'. Time grows with the lags.
     """
-    program = Program.make(model, segment, point, weights)
-    return None if program is None else program.double_sum(x0, into, r)
+    store = _kept.get()
+    kept = store and store.find(_key(model, segment, point, x0, weights), 0, columns=True)
+    if not kept or kept.columns is None:
+        program = Program.make(model, segment, point, weights)
+        return None if program is None else program.double_sum(x0, into, r)
+    counted = np.isfinite(np.column_stack(segment.y))
+    if segment.keep:
+        counted &= np.column_stack(segment.keep) > 0
+    counted[: weights.settle] = False
+    return double_sum_of_columns(kept.columns, counted, into, r)

@@ -80,4 +80,13 @@ static void add_influence(const influences *a, double *const *v, const int *pres
     else influence(a, v, present, slot, counts, a->outputs);
 }
 
+/* The double sum over columns that are kept: samples x outputs x columns, of which those that are counted take part. */
+EXPORTED void seaopt_sum_twice(const influences *a, const double *columns, const int *counted, long samples) {
+    const double *v[a->outputs];
+    for (long k = 0; k < samples; k++) {
+        for (long o = 0; o < a->outputs; o++) v[o] = columns + (k * a->outputs + o) * a->columns;
+        add_influence(a, (double *const *)v, counted + k * a->outputs, k % (a->lags + 1), 1);
+    }
+}
+
 EXPORTED const column_sums seaopt_sums = {add_products, add_gram, add_influence};

@@ -62,6 +62,7 @@ def run_score_tests(
     if not names and not data:
         return {}
     trial, z = minimum.problem.rebuild(free_more(fit, names), minimum.z, data)
+    trial.keep(z)
     evaluation = trial.evaluate(z)
     if not np.isfinite(evaluation.cost):
         return {}
@@ -122,7 +123,7 @@ def _compute_scores(
     trial: FitProblem, evaluation: Evaluation, places: Int[np.ndarray, " c"]
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return scores, their information, and their variances with the residuals as coloured as they are."""
-    unknowns, z = trial.unknowns, evaluation.z
+    unknowns, z = trial.unknowns, evaluation.passes.z  # whose passes are kept
     apart = find_blocked(evaluation, unknowns.low, unknowns.high)  # a bound takes the place of a zero gradient
     apart[places] = True
     kept = np.flatnonzero(~apart)

@@ -163,17 +163,30 @@ class FitExperiment:
         """Return, for each output, the unknown of each derivative column of a pass; -1 where that is known."""
         return segment.columns if self.predictor is None else segment.predictor_columns
 
+    def count_bytes(self) -> int:
+        """Return the room that the outputs and columns of all passes take."""
+        return 8 * sum(s.samples.n * sum(2 + len(places) for places in self.columns(s)) for s in self.segments)
+
     def run(self, segment: FitSegment, z: Vector, **keep: Any) -> Pass:
         """Run the pass of one segment."""
         return run_passes(self.model, segment.samples, self.point(z), segment.start(z), self.weights, **keep)
 
-    def run_all(self, z: Vector) -> tuple[Pass, ...]:
-        """Run the pass of every segment; those of a nonlinear plant keep the outputs of the first samples."""
+    def run_all(self, z: Vector, *, keep: bool = False) -> tuple[Pass, ...]:
+        """Run the pass of every segment; those of a nonlinear plant keep the outputs of the first samples. `keep`: all
+        of it, see `run_passes`.
+        """
         point, weights = self.point(z), self.weights
         rows = 0 if self.model.linear else FIRST_SAMPLES
         return tuple(
             run_passes(
-                self.model, segment.samples, point, segment.start(z), weights, outputs=rows > 0, output_rows=rows
+                self.model,
+                segment.samples,
+                point,
+                segment.start(z),
+                weights,
+                outputs=rows > 0,
+                output_rows=rows,
+                keep=keep,
             )
             for segment in self.segments
         )

@@ -23,7 +23,7 @@ where noise is hardly there it is the true second derivative.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -46,7 +46,7 @@ from seaopt.estimation.problem.unknowns import Unknowns, collect
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.friction import list_smoothing
 from seaopt.records import record
-from seaopt.simulation import Pass, threads
+from seaopt.simulation import Pass, measure_room, threads
 
 LOST = 1e-3  # below zero: a sum of squares that is nothing but rounding of a far larger one
 ALONE = 8_000  # samples below which experiments are not worth a thread each
@@ -127,11 +127,17 @@ class FitProblem:
         """Call for every experiment; in threads of their own where they are long enough."""
         if len(self.experiments) < 2 or sum(experiment.samples for experiment in self.experiments) < ALONE:
             return [call(experiment) for experiment in self.experiments]
-        return list(threads().map(call, self.experiments))
+        futures = [threads().submit(copy_context().run, call, experiment) for experiment in self.experiments]
+        return [future.result() for future in futures]
 
     def map_outputs(self, call: Callable[[FitOutput], T]) -> dict[str, dict[str, T]]:
         """Call for every output, and return what comes of it by experiment and output."""
         return {e.name: {output.name: call(output) for output in e.outputs} for e in self.experiments}
+
+    def keep(self, z: Vector) -> None:
+        """Make the passes at z with all that may be asked of them, where there is room to keep them."""
+        if sum(experiment.count_bytes() for experiment in self.experiments) <= measure_room():
+            self.map(lambda experiment: experiment.run_all(z, keep=True))
 
     def evaluate(self, z: Vector) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""

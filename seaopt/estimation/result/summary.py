@@ -53,6 +53,8 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     evaluation = solution.evaluation
     if not np.isfinite(evaluation.cost):
         raise EstimationError(f"the fit has no finite cost: {solution.message}")
+    if diagnostics:
+        problem.keep(z)
     statistics = compute_statistics(problem, z) if diagnostics else None
     seen_white, seen_robust, joint, unseen, variance = _compute_covariances(problem, evaluation, statistics)
     names = unknowns.names[:p]

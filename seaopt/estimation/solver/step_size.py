@@ -123,7 +123,10 @@ def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) ->
             return problem, evaluation, checks
         trusted = all(new < MUCH_FINER * old for new, old in zip(finer, substeps, strict=True))
         problem = _with_substeps(problem, finer)
-        evaluation = problem.evaluate(evaluation.z)
+        # Where the error was looked at steps of half the length have been made, and where those do are kept.
+        there = problem.evaluate(evaluation.passes.z if problem.straight else evaluation.z)
+        straight = problem.straight and np.isfinite(there.cost)
+        evaluation = problem.follow(there, evaluation.z) if straight else there
         if trusted:
             return problem, evaluation, checks
 

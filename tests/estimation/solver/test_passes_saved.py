@@ -12,7 +12,7 @@ import seaopt as so
 from seaopt.estimation.problem.correlation import LaggedSums
 from seaopt.estimation.problem.normal_equations import QuadraticModel
 from seaopt.estimation.solver.least_squares import minimise
-from seaopt.simulation import Clock, Point, Segment, Weights, double_sum, make_model, run_passes
+from seaopt.simulation import Clock, Point, Segment, Weights, double_sum, keep_passes, make_model, run_passes, stream
 from seaopt.simulation.compiled import PARALLEL, Program
 from seaopt.simulation.interpreted import interpret_pass
 from seaopt.simulation.native import find_compiler
@@ -88,6 +88,53 @@ def test_the_double_sum_is_numpys(case, rows, lags, p):
     assert sums is not None
     for found, expected_sum in zip(sums, (expected, together), strict=True):
         np.testing.assert_allclose(found, expected_sum, rtol=1e-9, atol=1e-10 * np.max(np.abs(expected)))
+
+
+@needs_compiler
+@pytest.mark.parametrize("settle", [0, 300])
+def test_what_is_kept_serves_for_what_is_asked_later(case, settle, monkeypatch):
+    """Sums, outputs, columns and double sums of a kept pass are those of passes made anew; none is simulated again."""
+    model, segment, point, x0 = case
+    weights = replace(Weights.plain(2), settle=settle)
+    nc = run_passes(model, segment, point, x0, weights, stop=1, sums=False, columns=True).columns.shape[2]
+    rng = np.random.default_rng(4)
+    into, r = rng.normal(size=(2, 3, nc)), rng.normal(size=(6, 2, 2))
+    into[:, :, 0], r[0] = 0.0, r[0] + r[0].T
+
+    def ask():
+        parts = [part.outputs.copy() for part in stream(model, segment, point, x0, weights, chunk=3_000)]
+        columns = [
+            part.columns.copy() for part in stream(model, segment, point, x0, weights, chunk=3_000, columns=True)
+        ]
+        whole = run_passes(model, segment, point, x0, weights, outputs=True, output_rows=50)
+        twice = double_sum(model, segment, point, x0, weights, into, r)
+        return np.concatenate(parts), np.concatenate(columns), whole.gram, whole.count, whole.outputs, twice
+
+    expected = ask()
+    with keep_passes():
+        run_passes(model, segment, point, x0, weights, keep=True)
+        monkeypatch.setattr(Program, "run", None)
+        found = ask()
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-11 * np.max(np.abs(theirs)))
+
+
+@needs_compiler
+def test_what_is_kept_is_of_one_point(case):
+    """Another parameter, state or weight is simulated anew, and so is everything once keeping has ended."""
+    model, segment, point, x0 = case
+    weights = Weights.plain(2)
+    with keep_passes():
+        first = run_passes(model, segment, point, x0, weights, keep=True)
+        for other in (
+            (replace(point, theta=1.01 * point.theta), x0, weights),
+            (replace(point, offset=point.offset + 1.0), x0, weights),
+            (point, x0 + 1e-3, weights),
+            (point, x0, replace(weights, settle=100)),
+        ):
+            assert not np.array_equal(run_passes(model, segment, *other).gram, first.gram)
+        assert run_passes(model, segment, point, x0, weights).gram is first.gram
+    assert run_passes(model, segment, point, x0, weights).gram is not first.gram
 
 
 def test_lagged_sums_are_numpys():
