@@ -543,4 +543,5 @@ def _compute_tracking_time(law: Law) -> float:
     column = 0 if law.b[m - 1, 0] else 1
     # The coefficient of w^(m-1), w = 1/(z - 1): the next one of the chain, or what is left at 0 Hz.
     following = law.b[m - 2, column] if m > 1 else law.static_rest[column]
-    return law.sample_time_s * max(abs(float(following / law.b[m - 1, column]) - m), 1.0)
+    ratio = abs(float(following) / float(law.b[m - 1, column]) - m)
+    return law.sample_time_s * min(max(ratio, 1.0), 1e300)  # next to no integral it would be infinite
