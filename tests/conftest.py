@@ -55,7 +55,7 @@ checker = ModuleType("seaopt_type_checker")
 checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=OVERRIDES))
 sys.modules["seaopt_type_checker"] = checker
 
-ALWAYS, EVERY = 3, 200
+EVERY = 200
 numbers: dict[CodeType, int] = {}  # of functions: a hash of the code itself at every call takes longer than most calls
 calls: defaultdict[int, int] = defaultdict(int)
 
@@ -76,7 +76,7 @@ def resolve(hint, function):
 
 
 def check_calls(function):
-    """Check a function's first calls in each test, `ALWAYS` of them, then one in `EVERY`; a class's constructor's.
+    """Check a function's first call in each test, then one in `EVERY`; a class's constructor's.
 
     Checking each call takes half of the tests' time. What is defined inside a function counts as one function.
     """
@@ -92,7 +92,7 @@ def check_calls(function):
     def call(*args, **kwargs):
         nonlocal checked
         calls[number] = count = calls[number] + 1
-        if count > ALWAYS and count % EVERY:
+        if count > 1 and count % EVERY:
             return function(*args, **kwargs)
         if checked is None:
             checked = make_checked(function)
