@@ -41,13 +41,13 @@ nocompiler: $(READY)
 	SEAOPT_TYPES=0 SEAOPT_COMPILER=none $(PYTEST) -n 2 -q -m "not slow" $(INTERPRETED)
 
 # The lowest versions of the libraries that pyproject.toml declares; FLOOR_TESTS=... for some of the tests. What they
-# themselves depend on is newer, so that they may use what is deprecated there.
+# themselves depend on is newer, so that they may use what is deprecated there. Argument types: see `slow`.
 FLOORS      := $(VENV)-floors
 FLOOR_TESTS := tests
 floors: $(READY)
 	$(BIN)/python tools/floors.py > $(CACHE)/floors.txt
 	@sh tools/setup.sh $(FLOORS) $(CACHE)/floors.txt formats,test
-	$(FLOORS)/bin/python -m pytest -n 2 --dist worksteal -q -m "not slow" -W default::DeprecationWarning $(FLOOR_TESTS)
+	SEAOPT_TYPES=0 $(FLOORS)/bin/python -m pytest -n 2 --dist worksteal -q -m "not slow" -W default::DeprecationWarning $(FLOOR_TESTS)
 
 # Figures that a refactoring must keep, against tests/golden; SUBJECTS="draws schedule" for some of them.
 golden: $(READY)

@@ -83,8 +83,8 @@ def test_eight_starts_of_a_stand_are_one_fit(thor):
         return so.fit([so.Experiment(plant=stand, log=log, outputs=("F1", "F2"))], start)
 
     assert check([fit(seed, log) for seed in range(8)], truth) == 8
-    shorter = [fit(0, log.between(0.0, end)) for end in (14.0, 17.0, 20.0)]
-    assert [check([each], truth) for each in shorter] == [1, 1, 1]
+    shorter = [fit(0, log.between(0.0, end)) for end in (14.0, 17.0)]
+    assert [check([each], truth) for each in shorter] == [1, 1]
 
 
 @pytest.mark.slow
@@ -102,7 +102,7 @@ def test_eight_starts_and_three_lengths_of_an_elastic_joint_agree():
         return so.fit([joint.observe(bench.plant, log.between(0.0, end_s))], start)
 
     assert check([fit(seed) for seed in range(8)], truth) >= 7
-    assert [check([fit(0, end)], truth) for end in (14.0, 17.0, 20.0)] == [1, 1, 1]
+    assert [check([fit(0, end)], truth) for end in (14.0, 17.0)] == [1, 1]
 
 
 @pytest.mark.slow
