@@ -13,7 +13,7 @@ What this may cost is counted in evaluations of the problem, so that the same lo
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,8 +43,10 @@ ROUND, ROUNDS = 4, 5  # iterations of a refit between two looks at whether it he
 MOST_ROUNDS = 15  # where each of them halves the power that is left
 HELPS = 0.02  # of a residual's power beyond noise, that a round has to take from some output
 CHANCE = 10.0  # of log-likelihood, over the colour of the residual, that chance may give
+UNDECIDED = 5.0  # of it, from which a refit near noise is neither chance nor sure
 CLOSE = 1e-3  # over the size of the start: the second radius that a step may have
 BASES = 3  # hypotheses, the best, beside which each other one is tried
+BACK = 1e-3  # of a residual's power, beyond the least yet, from which a refit is on its way back to it
 SLIGHT = 0.2  # of that: a step that may gain half as much ends a round
 NEAR = 1e-2  # squared standard deviations that may be left to the minimum
 
@@ -105,13 +107,9 @@ class Search:
 
     able: tuple[Refit, ...] = ()
     trials: tuple[HypothesisTrial, ...] = ()
-    nearest: Mapping[str, float] = field(default_factory=dict)  # all unknowns of the best refit
-
-    @property
-    def partial(self) -> Mapping[str, float] | None:
-        """The best refit's values where none removes a large excess: the truth is as near to them as to the fit."""
-        best = None if self.able else next(iter(self.trials), None)
-        return self.nearest if best is not None and best.excess < best.excess_before > REMOVED else None
+    # All unknowns of a refit that removes a large excess in part, or of one that chance hardly makes so likely: where
+    # none is able, the truth is as near to it as to the fit.
+    partial: Mapping[str, float] | None = None
 
     def yield_to_another(self) -> Search:
         """Return the search where another cause explains the logs better, so that none is adopted."""
@@ -239,7 +237,8 @@ def _refit(
         problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))
         evaluation = problem.assemble(evaluation.passes, evaluation.z)
         before_round, powers = powers, _measure_powers(evaluation)
-        comes_near = number == 0 and np.any(powers < HALF * before_round)  # a start may be far from the fit
+        away = before_round - least  # a start may be far from the fit, and takes rounds to come back
+        comes_near = np.any((away > BACK * least) & (powers - least < HALF * away))
         if np.all(powers > (1.0 - helps) * np.minimum(least, before_round)) and not comes_near:
             break
         if number >= ROUNDS - 1 and not np.any(powers < HALF * before_round):
@@ -340,7 +339,16 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
     outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]], *["tried" for _ in others]]
     ranked = [*tied, *others]
     trials = tuple(_state(refit, outcome, first) for refit, outcome in zip(ranked, outcomes, strict=True))
-    return Search(able=tuple(tied), trials=trials, nearest=ranked[0].values if ranked else {})
+    return Search(able=tuple(tied), trials=trials, partial=None if able else find_partial(refits, first, colour))
+
+
+def find_partial(refits: Sequence[Refit], first: float, colour: float) -> Mapping[str, float] | None:
+    """Return the values of the refit that is as near to the truth as the fit; None where there is no such refit."""
+    if first > REMOVED:
+        best = min(refits, key=lambda refit: refit.excess, default=None)
+        return best.values if best is not None and best.excess < first else None
+    best = max(refits, key=lambda refit: refit.gain, default=None)
+    return best.values if best is not None and best.gain > UNDECIDED * colour and first <= ASKS else None
 
 
 def _state(refit: Refit, outcome: Outcome, first: float) -> HypothesisTrial:

@@ -145,13 +145,12 @@ def judge(
 
 
 def _hangs_on_little(fit: Fit, findings: Sequence[FitFinding]) -> bool:
-    """Tell whether values are known only roughly, or weakly apart by residuals that are not noise: a scale that a small
-    part of the residual tells is moved far by as little that the model lacks.
+    """Tell whether values are known only roughly, or weakly apart: a scale that a small part of the log tells is moved
+    far by so little that the model lacks that the residual looks white.
     """
-    coloured = any(fitted.whiteness_p < DOUBTFUL for _, fitted in _list_outputs(fit))
     weak = {name for direction in fit.identifiability.weak for name in direction}
     hanging = any((fit.parameters[name].known or 0.0) > HARDLY for name in weak)
-    return any(finding.kind == "rough" for finding in findings) or (coloured and hanging)
+    return hanging or any(finding.kind == "rough" for finding in findings)
 
 
 def _tells(fit: Fit, validation: Experiment) -> bool:

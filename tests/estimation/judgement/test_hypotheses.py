@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.estimation.judgement.hypothesis_search import ASKS, NEARLY, REMOVED
+from seaopt.estimation.judgement.hypothesis_search import ASKS, NEARLY, REMOVED, Refit, find_partial
 from seaopt.estimation.judgement.intervals import find_rough
 from seaopt.estimation.result.model_error import ModelError
 from seaopt.estimation.result.widening import widen
@@ -99,7 +100,7 @@ def test_what_removes_the_excess_is_named_with_its_value(effects, part, value):
     assert not result.met
 
 
-def record_screw(lag_s, seed=0):
+def record_screw(lag_s, noise=2.0, seed=0):
     """Return the log of a screw on a held spring: two load cells that a mass of a pound tells apart, F2 = F1 + m dv/dt,
     and a current that lags its command, which is held between samples and arrives a millisecond late.
     """
@@ -121,25 +122,51 @@ def record_screw(lag_s, seed=0):
     states = np.array(integrate(rates, 3, late, 1e-3, 8))[:, ::2]
     rng, force = np.random.default_rng(seed), p["k"] * states[0]
     outside = force + p["m_l"] * np.array([accelerate(x) for x in states.T])
-    noisy = {"F1": force + rng.normal(scale=2.0, size=n), "F2": outside + rng.normal(scale=2.0, size=n)}
+    noisy = {"F1": force + rng.normal(scale=noise, size=n), "F2": outside + rng.normal(scale=noise, size=n)}
     return so.Log.from_arrays(time=t, I=current, **noisy)
+
+
+def fit_screw(log):
+    plant = so.plants.high_impedance()
+    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
+    experiment = so.Experiment(plant=plant, log=log, outputs=("F1", "F2"), delay_s=delay, name="log")
+    return so.fit([experiment], plant.defaults.update(**SCREW).free("J", "b_r", "k", "f_c", "eta"))
 
 
 def test_a_scale_that_little_tells_is_not_known_where_the_current_lags():
     """Inertia, damping and stiffness together hang on the small difference of the cells: a lag moves all by more than
     they seem to be known to, and leaves a residual of hardly more than noise.
     """
-    plant, log = so.plants.high_impedance(), record_screw(1.0 / (2.0 * math.pi * 140.0))
-    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
-
-    experiment = so.Experiment(plant=plant, log=log, outputs=("F1", "F2"), delay_s=delay, name="log")
-    result = so.fit([experiment], plant.defaults.update(**SCREW).free("J", "b_r", "k", "f_c", "eta"))
+    result = fit_screw(record_screw(1.0 / (2.0 * math.pi * 140.0)))
     assert max(row.excess for row in result.outputs["log"].values()) < ASKS
     assert not result.met
     (best, *_) = result.hypotheses
     assert (best.parts, best.outcome) == (("current_loop",), "adopted")
     assert best.frees["current_loop_hz"] == pytest.approx(140.0, rel=0.05)
     assert best.parameters["k"] == pytest.approx(SCREW["k"], rel=0.02)
+
+
+def test_what_hangs_on_little_asks_even_where_the_residual_looks_white():
+    result = fit_screw(record_screw(1.0 / (2.0 * math.pi * 100.0), noise=10.0))
+    assert min(row.whiteness_p for row in result.outputs["log"].values()) > 0.05
+    (best, *_) = result.hypotheses
+    assert (best.parts, best.outcome) == (("current_loop",), "adopted")
+    assert best.frees["current_loop_hz"] == pytest.approx(100.0, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("first", "gains", "expected"),
+    [
+        (1.0, (1.0, 4.0), None),  # chance
+        (1.0, (1.0, 7.0), 7.0),  # neither chance nor sure
+        (2.0, (1.0, 7.0), None),  # an excess that asks for another effect
+        (9.0, (7.0, 1.0), 7.0),  # takes a part of a large excess
+    ],
+)
+def test_intervals_reach_to_what_is_neither_chance_nor_sure(first, gains, expected):
+    refits = [Mock(spec=Refit, gain=gain, excess=8.0 - 0.1 * gain, values={"k": gain}) for gain in gains]
+    values = find_partial(refits, first, colour=1.0)
+    assert values == (expected and {"k": expected})
 
 
 def test_a_right_model_is_asked_nothing():
