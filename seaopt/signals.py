@@ -17,6 +17,7 @@ HOLDING_NAMES = frozenset({"duty", "goal"})  # of inputs that hold a value for a
 INPUT_UNITS = frozenset({"A", "V"})
 SAME_SIGN = ("f1", "f2")  # both forces of an actuator between two links
 REFERENCE = "reference"  # of a law, in a log that was taken under it
+TARGET_LOG = "SEALOG1"  # with which a log begins that the C beside a law writes
 REFERENCES = (REFERENCE, "ref")  # what its column is called where nobody says
 
 
@@ -86,12 +87,15 @@ class Table:
         The file, or the files.
     notes : tuple of str
         What was done on reading, one sentence each.
+    law : str
+        Hash of the law that it says it was taken under; empty where it does not.
     """
 
     time: Float[np.ndarray, " n"]
     signals: Mapping[str, Signal]
     source: str
     notes: tuple[str, ...] = ()
+    law: str = ""
 
     def __len__(self) -> int:
         return int(self.time.size)

@@ -14,6 +14,7 @@ from seaopt.cli.session import OWN_LAW, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.codec import from_content, to_content
 from seaopt.control.deploy.export import export, read_guard
+from seaopt.control.deploy.target import Tare
 from seaopt.control.laws.plausibility import Agreement, GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
@@ -98,6 +99,19 @@ def export_controller(
     for note in content.get("notes") or () if amount == "verbose" else ():
         console.wrap(f"note: {note}", indent=2)
     return met
+
+
+def parse_tare(text: str | None) -> Tare | None:
+    """Return the tare that is typed, as NOISE:LIMIT; None for none."""
+    if text is None:
+        return None
+    try:
+        noise, limit = (float(each) for each in text.split(":"))
+        return Tare(noise=noise, limit=limit)
+    except (ValueError, ControlError):
+        raise ProblemError(
+            f"--tare {text}: is not the std of the force and the largest zero; type such as --tare 2:50"
+        ) from None
 
 
 def _list_typed(content: Mapping[str, Any], options: Mapping[str, Any]) -> list[str]:

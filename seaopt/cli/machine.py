@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from seaopt.cli.export import parse_tare
 from seaopt.cli.inspect import parse_pairs
 from seaopt.cli.progress import show_progress
 from seaopt.cli.provenance import FILES
@@ -138,10 +139,18 @@ def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[st
 
 
 def plan_bring_up(
-    problem: Path, folder: Path, *, share: float, bias: float, limits: Sequence[str], json: bool, amount: Amount
+    problem: Path,
+    folder: Path,
+    *,
+    share: float,
+    bias: float,
+    limits: Sequence[str],
+    tare: str | None,
+    json: bool,
+    amount: Amount,
 ) -> bool:
     """Plan the stages of the folder's controller, write and print them; return whether each has a certified law."""
-    session = Session(problem, folder)
+    session, zeroing = Session(problem, folder), parse_tare(tare)
     controller, source, errors = _take_controller(session), session.parameters(), Terminal(stderr=True)
 
     def tune_stage(spec: ControllerSpec) -> Controller:
@@ -169,7 +178,7 @@ def plan_bring_up(
             progress=tell,
         )
     target = folder / BRING_UP
-    write_bring_up(plan, target)
+    write_bring_up(plan, target, tare=zeroing)
     page = write_bring_up_page(
         plan,
         target / "bringup.html",

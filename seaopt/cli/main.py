@@ -367,9 +367,7 @@ def export(
     command_limit: Annotated[
         float | None, typer.Option(metavar="VALUE", help="The same for another command, in its unit: V, or a duty.")
     ] = None,
-    tracking_time: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Time constant of the anti-windup.")
-    ] = None,
+    tracking_time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Of the anti-windup.")] = None,
     derate: Annotated[
         bool | None,
         typer.Option(help='Lower the limit as the winding warms up; the plant needs the part "thermal".'),
@@ -390,9 +388,9 @@ def export(
     gate_ramp: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Time from the limit to zero at a fault; 0.1 if left out.")
     ] = None,
-    no_gate: Annotated[
-        bool, typer.Option("--no-gate", help="Leave out the problem file's gate: accept all readings.")
-    ] = False,
+    no_gate: Annotated[bool, typer.Option("--no-gate", help="Leave out the problem file's gate.")] = False,
+    log_rows: Annotated[int | None, typer.Option(metavar="N", help="C that logs each tick in a ring.")] = None,
+    tare: Annotated[str | None, typer.Option(metavar="STD:LIMIT", help="C that tares the force at rest.")] = None,
     allow_infeasible: Annotated[
         bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
     ] = False,
@@ -401,7 +399,7 @@ def export(
     verbose: Verbose = False,
 ) -> None:
     """Write the controller in DIR as C99, and its gains as a C header and a MATLAB script."""
-    from seaopt.cli.export import export_controller
+    from seaopt.cli.export import export_controller, parse_tare
 
     met = export_controller(
         results,
@@ -422,6 +420,8 @@ def export(
         command_limit=command_limit,
         tracking_time_s=tracking_time,
         derate=derate,
+        log_rows=log_rows,
+        tare=parse_tare(tare),
         allow_infeasible=allow_infeasible,
     )
     _exit_unless(met)
@@ -506,6 +506,7 @@ def bringup(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="Largest magnitude of an output: force, travel. Repeatable."),
     ] = None,
+    tare: Annotated[str | None, typer.Option(metavar="STD:LIMIT", help="C that tares the force at rest.")] = None,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -519,6 +520,7 @@ def bringup(
         share=share,
         bias=bias,
         limits=limit or (),
+        tare=tare,
         json=json,
         amount=_choose_amount(quiet, verbose),
     )

@@ -7,14 +7,15 @@ from dataclasses import field, replace
 from typing import Any
 
 from seaopt.codec import to_content
-from seaopt.control import Controller, draw
+from seaopt.control import Controller, draw, runnable
+from seaopt.control.deploy.target import hash_law
 from seaopt.control.laws.delay import find_drive
 from seaopt.errors import LogError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.logs import Log
 from seaopt.machine.differences import Differences, compare
 from seaopt.machine.periods import Blocks, cut_periods, join_blocks
-from seaopt.machine.replay import Replay, replay
+from seaopt.machine.replay import Cause, Replay, replay
 from seaopt.machine.response import Response, judge_response
 from seaopt.machine.ticks import take_ticks
 from seaopt.parameters import ParameterSet
@@ -153,7 +154,10 @@ def accept(
     if ranges and controller.design is not None:
         check_ranges(ranges, {"design plant": controller.design[0]})
     rows = [take_ticks(controller, log, reference) for log in logs]
-    replays = tuple(replay(controller, ticks, others) for ticks in rows)
+    replays = tuple(
+        _check_header(controller, log, replay(controller, ticks, others), others or {})
+        for log, ticks in zip(logs, rows, strict=True)
+    )
     result = Acceptance(controller=controller, sources=tuple(log.source for log in logs), replays=replays)
     if not result.replayed:
         return replace(result, left_out={"response": OTHER_LAW})
@@ -174,6 +178,19 @@ def accept(
     draws = list_draws(controller, uncertainty, ranges, DRAWS, SEED)
     differences = compare(controller, response.measured, whole, draws, confidence)
     return replace(result, response=response, differences=differences, left_out=left_out)
+
+
+def _check_header(controller: Controller, log: Log, row: Replay, others: Mapping[str, Controller]) -> Replay:
+    """Return a replay with the law that the log says it was taken under, where that is another and the replay does not
+    tell why.
+    """
+    explained = bool(row.causes) and row.causes[0].explains
+    if explained or log.law in ("", hash_law(runnable(controller), controller.outer)):
+        return row
+    named = [name for name, other in others.items() if hash_law(runnable(other), other.outer) == log.law]
+    kind, what = ("another law", named[0]) if named else ("law by the log's header", f"another, {log.law}")
+    cause = Cause(kind=kind, what=what, value=None, unit="", removes=1.0, explains=True)
+    return replace(row, met=False, causes=(cause, *row.causes))
 
 
 def list_draws(

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from seaopt.control import export
+from seaopt.control.deploy.target import LOG_ROWS, Tare
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
 from seaopt.machine.bringup import Band, BringUp, Stage
 
 PER_LINE = 8
 HEADER = """/* The reference of a stage of bring-up, made by seaopt: {phases} set(s) of phases, a period of
- * {period} ticks, at {rate} Hz.
+ * {period} ticks, at {rate} Hz, in {bytes} bytes of constants.
  * Call stage_reference(tick) once per tick, from 0; it ends after STAGE_TICKS ticks, and is zero from there on. */
 #ifndef STAGE_REFERENCE_H
 #define STAGE_REFERENCE_H
@@ -45,7 +46,7 @@ double stage_reference(unsigned long tick)
 """
 
 
-def write_bring_up(plan: BringUp, folder: Path | str) -> tuple[Path, ...]:
+def write_bring_up(plan: BringUp, folder: Path | str, *, tare: Tare | None = None) -> tuple[Path, ...]:
     """Write a folder for each stage, and bringup.json beside them.
 
     Parameters
@@ -54,6 +55,8 @@ def write_bring_up(plan: BringUp, folder: Path | str) -> tuple[Path, ...]:
         Of `bring_up`.
     folder : path
         Made if it does not exist.
+    tare : Tare, optional
+        Beside each law the C that averages the zero of the force at rest.
 
     Returns
     -------
@@ -68,11 +71,11 @@ def write_bring_up(plan: BringUp, folder: Path | str) -> tuple[Path, ...]:
     target = Path(folder)
     files = [write_json(target / "bringup.json", plan.to_dict())]
     for stage in plan.stages:
-        files += _write_stage(stage, target / stage.name)
+        files += _write_stage(stage, target / stage.name, tare)
     return tuple(files)
 
 
-def _write_stage(stage: Stage, folder: Path) -> list[Path]:
+def _write_stage(stage: Stage, folder: Path, tare: Tare | None) -> list[Path]:
     excitation, unit = stage.excitation, stage.controller.command.reference_unit
     reference = excitation.reference
     time = excitation.sample_time_s * np.arange(reference.size)
@@ -80,10 +83,10 @@ def _write_stage(stage: Stage, folder: Path) -> list[Path]:
     period, phases = excitation.waves.shape[1], len(excitation.waves)
     waves = ",\n".join(f"{{\n{_list_numbers(excitation.bias + wave)}\n}}" for wave in excitation.waves)
     words = {"phases": phases, "period": period, "periods": excitation.periods, "ticks": reference.size, "unit": unit}
-    header = HEADER.format(**words, rate=f"{1.0 / excitation.sample_time_s:.10g}")
+    header = HEADER.format(**words, bytes=8 * period * (1 + phases), rate=f"{1.0 / excitation.sample_time_s:.10g}")
     source = SOURCE.format(**words, fade=_list_numbers(excitation.fade), waves=waves)
     return [
-        *export(stage.controller, folder, allow_infeasible=True),
+        *export(stage.controller, folder, allow_infeasible=True, log_rows=LOG_ROWS, tare=tare),
         write_json(folder / "controller.json", stage.controller.to_dict()),
         write_log(log, folder / "reference.csv"),
         write_text(folder / "reference.h", header),

@@ -90,7 +90,8 @@ def _describe_stage(stage: Stage) -> Section:
         f"{format_number(period, 3)} s, then {format_count(len(excitation.waves), 'set')} of phases of "
         f"{excitation.periods} periods of {format_number(period, 3)} s, {f.size} lines from {format_number(f[0], 3)} "
         f"to {format_number(f[-1], 3)} Hz, then it fades out.",
-        f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)}.",
+        f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)} "
+        f"({stage.name}/force_law_log.c does).",
         f"Expect: a step of the reference{_say_size(stage)} peaks at {' to '.join(dict.fromkeys(top))} of its size "
         f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
     ]

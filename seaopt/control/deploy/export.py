@@ -30,6 +30,14 @@ from seaopt.control.deploy.c_text import (
     strip_markup,
 )
 from seaopt.control.deploy.schedule_export import SCHEDULE_TEMPLATES, describe_schedule, read_runnable
+from seaopt.control.deploy.target import (
+    LOG_TEMPLATES,
+    TARE_TEMPLATES,
+    Tare,
+    describe_log,
+    describe_tare,
+    hash_law,
+)
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
@@ -71,6 +79,8 @@ def export(
     derate: bool | HeatGuard | None = None,
     allow_infeasible: bool = False,
     fit_met: bool | None = None,
+    log_rows: int | None = None,
+    tare: Tare | None = None,
 ) -> tuple[Path, ...]:
     """Write a controller as C99, with its gains as a C header and as a MATLAB script.
 
@@ -101,6 +111,11 @@ def export(
     fit_met : bool, optional
         Whether the fit that it was tuned with is met; the files state one that is not. What a controller.json says of
         it, if left out.
+    log_rows : int, optional
+        Rows of a ring, a power of two: NAME_log.h and NAME_log.c log what the law is given and returns
+        (`seaopt.control.deploy.target`).
+    tare : Tare, optional
+        NAME_tare.h and NAME_tare.c average the zero of the force at rest.
 
     Returns
     -------
@@ -181,6 +196,17 @@ def export(
         "fit_met": fit_met,
         "raised_from": strip_markup(find_raised_limit(stored["command"], stored["spec"], limit)),
     }
+    templates = dict(templates)
+    if log_rows is not None:
+        names = tuple(dict.fromkeys((*_list_signals(stored), *law.further)))
+        units, digest = _list_units(controller, stored), hash_law(law, stored["outer"])
+        context |= describe_log(context, law, names, log_rows, units=units, digest=digest)
+        templates |= LOG_TEMPLATES
+    if tare is not None:
+        require_type(tare, Tare, "tare", "give a Tare", ControlError)
+        unit_after = strip_markup(f" {stored['command'].reference_unit}")
+        context |= {"tare": describe_tare(tare, law.sample_time_s), "unit_after": unit_after}
+        templates |= TARE_TEMPLATES
     texts = {
         pattern.format(prefix): render(template, context | numbers.get(pattern[-2:], {}))
         for pattern, template in templates.items()
@@ -298,6 +324,20 @@ def _write_gate(gate: PlausibilityGate, sample_time_s: float, number: Callable[[
 
 def _list_signals(stored: Mapping[str, Any]) -> tuple[str, ...]:
     return stored["reads"] or list_names(stored["spec"].measured)
+
+
+def _list_units(controller: Any, stored: Mapping[str, Any]) -> dict[str, str]:
+    """Return the units of what a law reads, as far as its design plant, or what it is stored with, tells them."""
+    gate, link, terms = stored["gate"], stored["link"], stored["compensation"]
+    parts = () if terms is None else (terms.gravity, terms.ripple)
+    units = {part.reads: part.unit for part in parts if part is not None}
+    if link is not None:
+        units[link.measured] = link.unit
+    if gate is not None and gate.agreement is not None:
+        units |= dict(zip(gate.reads, gate.agreement.units, strict=False))
+    if isinstance(controller, Controller) and controller.design is not None:
+        units |= controller.see(controller.design[0]).outputs
+    return units | {_list_signals(stored)[0]: stored["command"].reference_unit}
 
 
 def _write_numbers(

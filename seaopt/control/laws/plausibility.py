@@ -128,6 +128,7 @@ class Agreement:
     weights: tuple[float, ...]  # of each, in the unit of the reading
     limit: float  # of the difference, with nothing deflected
     share: Annotated[float, Constraints(ge=0.0, le=MOST_SHARE)]  # of what the encoders say, besides
+    units: tuple[str, ...] = ()  # of the encoders
 
     def __post_init__(self) -> None:
         if len(self.weights) != len(self.reads):
@@ -221,8 +222,9 @@ class Agreement:
             )
         spread = math.hypot(noise[regulated], *((1.0 + share) * weights * [noise[name] for name in names]))
         limit = SIGMAS * spread + zero + latest * rate
+        units = tuple(plant.outputs[name] for name in names)
         rounded = tuple(float(f"{weight:.12g}") for weight in weights)  # the same on every machine
-        return cls(reads=names, weights=rounded, limit=limit, share=share)
+        return cls(reads=names, weights=rounded, limit=limit, share=share, units=units)
 
 
 def find_encoders(plant: Plant, regulated: str) -> tuple[str, ...]:

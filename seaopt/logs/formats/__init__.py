@@ -12,6 +12,7 @@ from pathlib import Path
 from seaopt.errors import LogError
 from seaopt.logs.formats.mat4 import is_mat4
 from seaopt.logs.formats.source import Field, Source, Window, check_count, keep_rows, translate_errors
+from seaopt.signals import TARGET_LOG
 
 __all__ = ["Field", "Source", "Window", "keep_rows", "open_source", "sniff"]
 
@@ -21,13 +22,14 @@ _MAGIC: tuple[tuple[bytes, str, str, str], ...] = (
     (b"MATLAB 7.3 MAT-file", "hdf5", "open_mat73", "MAT 7.3"),
     (b"MATLAB 5.0 MAT-file", "mat", "open_mat", "MAT 5"),
     (b"PAR1", "parquet", "open_parquet", "Parquet"),
-    (b"PK\x03\x04", "npz", "open_npz", "NPZ"),
+    (b"PK\x03\x04", "arrays", "open_npz", "NPZ"),
     (b"#ROSBAG V2.0\n", "ros", "open_bag", "ROS 1 bag"),
     (b"SQLite format 3\x00", "ros", "open_db3", "ROS 2 db3"),
     (b"\x89MCAP0\r\n", "ros", "open_mcap", "MCAP"),
     (b"MDF     ", "mdf", "open_mdf", "MDF"),
     (b"UnFinMF ", "mdf", "open_mdf", "MDF"),
     (b"TDSm", "tdms", "open_tdms", "TDMS"),
+    (TARGET_LOG.encode() + b" ", "arrays", "open_target_log", "a log of the target"),
 )
 _REFUSED: tuple[tuple[bytes, str], ...] = (
     (b"\x1f\x8b", "is compressed (gzip); unpack it first"),
@@ -38,6 +40,7 @@ _REFUSED: tuple[tuple[bytes, str], ...] = (
     (b"\xd0\xcf\x11\xe0", "is an old Office document; save the sheet as CSV"),
     (b"\x93NUMPY", "is one array without names; save the channels with np.savez"),
     (b"TDSh", "is the index of a TDMS file; give the .tdms file"),
+    (b"SEALOG", "is a log of the target that this version does not read; install the newest seaopt"),
     (b"#ROSBAG", "is a ROS bag of a version other than 2.0; convert it with rosbag fix"),
     *((b"\x80" + bytes([n]), "is a Python pickle, which could run code; save it as NPZ or CSV") for n in (2, 3, 4, 5)),
 )  # fmt: skip
@@ -45,7 +48,8 @@ _JSON_NAMES = (".json", ".jsonl", ".ndjson")
 _BINARY_NAMES = {".mat": "MAT file of version 4, 5 or 7.3",
                  ".bag": "ROS bag", ".mcap": "MCAP file",
                  ".db3": "ROS 2 bag", ".parquet": "Parquet file", ".npz": "NPZ archive", ".h5": "HDF5 file",
-                 ".hdf5": "HDF5 file", ".mf4": "MDF file", ".tdms": "TDMS file"}  # fmt: skip
+                 ".hdf5": "HDF5 file", ".mf4": "MDF file", ".tdms": "TDMS file",
+                 ".sealog": "log of the target"}  # fmt: skip
 
 
 def open_source(path: Path) -> Source:

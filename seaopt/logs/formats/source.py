@@ -75,6 +75,7 @@ class Source:
     # Of (names, where): as `load`, of the rows in which columns, of text too, have given values.
     load_where: Callable[[Sequence[str], Where], dict[str, Float[np.ndarray, " _"]]] | None = None
     rows: str = ""  # which rows are read, where not all are
+    law: str = ""  # hash of the law that it says it was taken under
 
     def read(self, names: Sequence[str], window: Window | None = None) -> dict[str, Float[np.ndarray, " _"]]:
         """Return the data of fields that share a clock. Raises LogError: damage, or a cell that is not a number."""

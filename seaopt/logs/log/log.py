@@ -49,6 +49,8 @@ class Log:
         Where the log came from, for messages and reports.
     notes : tuple of str
         What was done to it since, one sentence each.
+    law : str
+        Hash of the law that it says it was taken under; empty where it does not.
 
     Examples
     --------
@@ -65,6 +67,7 @@ class Log:
     signals: Mapping[str, Signal]
     source: str = "arrays"
     notes: tuple[str, ...] = ()
+    law: str = ""
     period: float = field(init=False)
     gap_s: float = field(init=False)
 

@@ -111,7 +111,8 @@ def read_table(
         signals[name] = _build_signal(name, channel, arrays.pop(name), chosen.clock, digest_of_file)
         notes += _remark_on(signals[name])
     names = ", ".join(str(source.path) for source in sources)
-    return Table(time=clock, signals=signals, source=names, notes=tuple(notes))
+    law = next((source.law for source in sources if source.law), "")
+    return Table(time=clock, signals=signals, source=names, notes=tuple(notes), law=law)
 
 
 def _open_sources(path: str | Path | Sequence[str | Path]) -> list[Source]:
@@ -183,7 +184,7 @@ def read_log(
         if not np.any(np.isfinite(signal.values)):
             raise LogError(f'{table.source}: column "{signal.origin.column}" holds no number; choose another column')
     try:
-        return Log(time=table.time, signals=table.signals, source=table.source, notes=table.notes)
+        return Log(time=table.time, signals=table.signals, source=table.source, notes=table.notes, law=table.law)
     except LogError as error:  # the columns have one length: it is their time
         clock = select(_open_sources(path), time, channels, align, counter, rate_hz).clock
         raise LogError(f'{error}; if "{clock.name}" is not the time, {advise_time(clock.source)}') from error
