@@ -16,7 +16,7 @@ from seaopt.cli.provenance import FILES
 from seaopt.cli.session import SCHEMAS, Session
 from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
-from seaopt.control import Controller, ControllerSpec
+from seaopt.control import Controller, ControllerSpec, ScheduledController
 from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
@@ -24,6 +24,7 @@ from seaopt.machine import Acceptance, BringUp, accept, bring_up, write_bring_up
 from seaopt.machine.acceptance import take_ranges
 from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
+from seaopt.machine.stepped import Source
 from seaopt.problem import certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.problem.stages import list_plants
@@ -42,6 +43,7 @@ def accept_logs(
     *,
     reference: str | None,
     stage: str | None,
+    at: float | None,
     json: bool,
     amount: Amount,
 ) -> bool:
@@ -49,21 +51,26 @@ def accept_logs(
     return whether it is accepted.
     """
     session = Session(problem, folder)
-    controller, errors = _take_controller(session), Terminal(stderr=True)
+    law, errors = session.law(), Terminal(stderr=True)
+    source: Source = law if session.problem.mpc is None else session.plan()
     path = folder / FILES["tune"]
     if stage is not None:
         path = folder / BRING_UP / stage / FILES["tune"]
         if not path.is_file():
             raise ProblemError(f"--stage {stage}: {path} is not there; make it: seaopt bringup {problem} -o {folder}")
         plant = list_plants(session.problem, session.parameters())[0]
-        controller = Controller.from_dict(read_json(path, SCHEMAS["tune"]), plant, session.values())
+        source = Controller.from_dict(read_json(path, SCHEMAS["tune"]), plant, session.values())
+    controller = law.controllers[0] if isinstance(law, ScheduledController) else law
     units = _list_units(controller)
+    if isinstance(source, ScheduledController):
+        units[source.over] = source.unit
     with show_progress(errors, "judging the logs", errors.say) as tell:
         tell("reading the logs", 0.0)
         read = [read_loop_log(session.problem, log, units, reference) for log in logs]
         result = accept(
-            controller,
+            source,
             read,
+            at=at,
             others=_find_others(folder, path, controller),
             uncertainty=session.parameters(),
             ranges=take_ranges(controller, session.problem.ranges),
@@ -92,13 +99,13 @@ def _take_controller(session: Session) -> Controller:
     law = session.law()
     if session.problem.mpc is not None:
         raise ProblemError(
-            f"{session.problem.source}: predictive control is not replayed; try the machine with a law first, in a "
-            'problem file with structure = "pid" and without [mpc]'
+            f"{session.problem.source}: predictive control has no stages; try the machine with a law first, in a "
+            'problem file with structure = "pid" and without [mpc]; then seaopt accept judges it as any other'
         )
     if not isinstance(law, Controller):
         raise ProblemError(
-            f"{session.problem.source}: a schedule is not replayed; keep {law.over} at a value, and in Python judge "
-            f"the law there: so.accept(schedule.at({law.points[0]:g}), [log]), bring_up likewise; schedule is what "
+            f"{session.problem.source}: a schedule has no stages; keep {law.over} at a value, and plan those of the "
+            f"law there in Python: so.bring_up(schedule.at({law.points[0]:g}), ...); schedule is what "
             "so.tune_certified returns, its controller"
         )
     return law

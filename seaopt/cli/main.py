@@ -542,6 +542,10 @@ def accept(
         str | None,
         typer.Option(metavar="NAME", help="A stage of seaopt bringup, whose law ran; the full law if left out."),
     ] = None,
+    at: Annotated[
+        float | None,
+        typer.Option(metavar="VALUE", help="Where a schedule's variable stood, in its SI unit, if no column has it."),
+    ] = None,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -555,6 +559,7 @@ def accept(
         output,
         reference=reference,
         stage=stage,
+        at=at,
         json=json,
         amount=_choose_amount(quiet, verbose),
     )

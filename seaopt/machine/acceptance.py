@@ -6,23 +6,29 @@ from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any
 
+import numpy as np
+
 from seaopt.codec import to_content
-from seaopt.control import Controller, draw, runnable
+from seaopt.control import Controller, ForceMPC, ScheduledController, draw, runnable
 from seaopt.control.deploy.target import hash_law
 from seaopt.control.laws.delay import find_drive
 from seaopt.errors import LogError, require_number, require_type
 from seaopt.estimation import Fit
+from seaopt.formatting import join_words
 from seaopt.logs import Log
 from seaopt.machine.differences import Differences, compare
 from seaopt.machine.periods import Blocks, cut_periods, join_blocks
 from seaopt.machine.replay import Cause, Replay, replay
 from seaopt.machine.response import Response, judge_response
-from seaopt.machine.ticks import take_ticks
+from seaopt.machine.stepped import Source, stand
+from seaopt.machine.ticks import Ticks, take_ticks
 from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
 from seaopt.robustness import check_ranges
+from seaopt.units import unit_after
 
 DRAWS, SEED = 200, 1
+SAME_PLACE = 0.02  # of the span of a schedule's points: a variable that moves less stands still
 OTHER_LAW = "the logs are not of this law; mend that first, then record again"
 ACCEPTANCE_SCHEMA = "seaopt/acceptance/1"
 
@@ -34,7 +40,8 @@ class Acceptance(Result, Worded):
     Parameters
     ----------
     controller : Controller
-        The law that is to have run.
+        The law that is to have run: of a schedule where its variable stood, of predictive control while no limit is
+        active.
     sources : tuple of str
         The logs.
     replays : tuple of Replay
@@ -45,6 +52,8 @@ class Acceptance(Result, Worded):
         The measured plant beside the certified one.
     left_out : mapping of str to str
         Why there is no response, or none of a log.
+    place : (str, float, str) or None
+        Of a schedule its variable, where that stood, and its unit.
     """
 
     controller: Controller
@@ -53,6 +62,7 @@ class Acceptance(Result, Worded):
     response: Response | None = None
     differences: Differences | None = None
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+    place: tuple[str, float, str] | None = None
 
     @property
     def replayed(self) -> bool:
@@ -77,15 +87,17 @@ class Acceptance(Result, Worded):
             "response": None if self.response is None else self.response.to_dict(),
             "differences": self.differences,
             "left_out": self.left_out,
+            "place": None if self.place is None else dict(zip(("over", "value", "unit"), self.place, strict=True)),
         }
         return to_content(content)
 
 
 def accept(
-    controller: Controller,
+    controller: Source,
     logs: Sequence[Log],
     *,
     reference: str | None = None,
+    at: float | None = None,
     others: Mapping[str, Controller] | None = None,
     uncertainty: Fit | ParameterSet | None = None,
     ranges: Mapping[str, tuple[float, float]] | None = None,
@@ -95,13 +107,15 @@ def accept(
 
     Parameters
     ----------
-    controller : Controller
+    controller : Controller, ScheduledController or ForceMPC
         The law that is to have run.
     logs : sequence of Log
         Each with a row per tick of the law: its reference, what it read (`controller.signals`), and what it
-        commanded, under the names of the plant's outputs and of the commanded input.
+        commanded, under the names of the plant's outputs and of the commanded input; of a schedule its variable.
     reference : str, optional
         The reference's channel; "reference" or "ref" if left out.
+    at : float, optional
+        Where a schedule's variable stood, of logs that do not have it.
     others : mapping of name to Controller, optional
         Laws that may have run in its place, such as those of earlier tunings.
     uncertainty : Fit or ParameterSet, optional
@@ -124,6 +138,10 @@ def accept(
 
     Notes
     -----
+    A schedule is replayed as its variable moves; its response is judged where that stands still, against the figures
+    that the law has there. Predictive control is replayed with its limits; its response is that of the law while none
+    is active.
+
     The response is judged on logs whose reference is periodic, of three periods at least, the first of which is left
     out; with dry friction six sets of random phases are needed. Limits are those of the controller's specification with
     5 % of grace; of the bandwidth with 10 %.
@@ -143,7 +161,8 @@ def accept(
     >>> so.accept(controller, [log]).replays[0].met
     True
     """
-    require_type(controller, Controller, "controller", "give what tune or assess returned", LogError)
+    kinds = (Controller, ScheduledController, ForceMPC)
+    require_type(controller, kinds, "controller", "give what tune, assess or force_mpc returned", LogError)
     require_type(logs, Sequence, "logs", "give a list of logs", LogError)
     if not logs:
         raise LogError("logs is empty; give the logs that were recorded under the law")
@@ -153,12 +172,17 @@ def accept(
         raise LogError(f"confidence = {confidence:g} is not between 0.5 and 1; give 0.95")
     if ranges and controller.design is not None:
         check_ranges(ranges, {"design plant": controller.design[0]})
-    rows = [take_ticks(controller, log, reference) for log in logs]
+    rows = list_ticks(controller, logs, reference, at)
     replays = tuple(
         _check_header(controller, log, replay(controller, ticks, others), others or {})
         for log, ticks in zip(logs, rows, strict=True)
     )
-    result = Acceptance(controller=controller, sources=tuple(log.source for log in logs), replays=replays)
+    law = stand(controller, rows[0].middle)
+    place = None
+    if isinstance(controller, ScheduledController) and rows[0].middle is not None:
+        place = controller.over, rows[0].middle, controller.unit
+    sources = tuple(log.source for log in logs)
+    result = Acceptance(controller=law, sources=sources, replays=replays, place=place)
     if not result.replayed:
         return replace(result, left_out={"response": OTHER_LAW})
     rows = [
@@ -168,29 +192,72 @@ def accept(
     blocks, left_out = list[Blocks](), dict[str, str]()
     for ticks in rows:
         try:
-            blocks.append(cut_periods(controller, ticks))
+            blocks.append(cut_periods(law, ticks if place is None else require_still(controller, ticks)))
         except LogError as error:
             left_out[ticks.source] = str(error)
     if not blocks:
         return replace(result, left_out=left_out)
-    response = judge_response(controller, join_blocks(blocks), confidence)
+    response = judge_response(law, join_blocks(blocks), confidence)
     whole = [ticks for ticks in rows if ticks.source not in left_out]
-    draws = list_draws(controller, uncertainty, ranges, DRAWS, SEED)
-    differences = compare(controller, response.measured, whole, draws, confidence)
+    draws = list_draws(law, uncertainty, ranges, DRAWS, SEED)
+    differences = compare(law, response.measured, whole, draws, confidence)
     return replace(result, response=response, differences=differences, left_out=left_out)
 
 
-def _check_header(controller: Controller, log: Log, row: Replay, others: Mapping[str, Controller]) -> Replay:
+def _check_header(source: Source, log: Log, row: Replay, others: Mapping[str, Controller]) -> Replay:
     """Return a replay with the law that the log says it was taken under, where that is another and the replay does not
     tell why.
     """
     explained = bool(row.causes) and row.causes[0].explains
-    if explained or log.law in ("", hash_law(runnable(controller), controller.outer)):
+    if explained or isinstance(source, ForceMPC) or log.law in ("", _hash(source)):
         return row
-    named = [name for name, other in others.items() if hash_law(runnable(other), other.outer) == log.law]
+    named = [name for name, other in others.items() if _hash(other) == log.law]
     kind, what = ("another law", named[0]) if named else ("law by the log's header", f"another, {log.law}")
     cause = Cause(kind=kind, what=what, value=None, unit="", removes=1.0, explains=True)
     return replace(row, met=False, causes=(cause, *row.causes))
+
+
+def _hash(source: Controller | ScheduledController) -> str:
+    """Return what tells a law from any other, as the log of the target has it."""
+    if isinstance(source, ScheduledController):
+        return hash_law(source.runnable(), source.controllers[0].outer)
+    return hash_law(runnable(source), source.outer)
+
+
+def list_ticks(source: Source, logs: Sequence[Log], reference: str | None, at: float | None) -> list[Ticks]:
+    """Return the ticks of logs. Raises LogError: those of a schedule stand at different values, or at none of it."""
+    over = source.over if isinstance(source, ScheduledController) else None
+    if at is not None and over is None:
+        raise LogError(f"at = {at:g}: the law is not scheduled; leave it out")
+    law = stand(source, at)
+    rows = [take_ticks(law, log, reference, over, at) for log in logs]
+    if not isinstance(source, ScheduledController):
+        return rows
+    low, high = source.points[0], source.points[-1]
+    middles = [ticks.middle or 0.0 for ticks in rows] + ([] if at is None else [require_number(at, "at", LogError)])
+    near = SAME_PLACE * (high - low)
+    for middle in middles:
+        if not low - near <= middle <= high + near:
+            raise LogError(
+                f"{over} is {middle:g}, and the schedule is from {low:g} to {high:g}{unit_after(source.unit)}; check "
+                "the column and its unit, or give --at VALUE"
+            )
+    if max(middles) - min(middles) > near:
+        values = join_words([f"{value:.4g}" for value in sorted(set(middles))])
+        raise LogError(f"the logs have {over} at {values}; accept those of each value by themselves")
+    return rows
+
+
+def require_still(source: Source, ticks: Ticks) -> Ticks:
+    """Return the ticks of a schedule whose variable stands still. Raises LogError: it moves."""
+    assert isinstance(source, ScheduledController) and ticks.place is not None
+    low, high = float(np.min(ticks.place)), float(np.max(ticks.place))
+    if high - low > SAME_PLACE * (source.points[-1] - source.points[0]):
+        raise LogError(
+            f"{ticks.source}: {source.over} moves from {low:.4g} to {high:.4g}{unit_after(source.unit)}, and the "
+            "response is judged where it stands; hold it at a value"
+        )
+    return ticks
 
 
 def list_draws(

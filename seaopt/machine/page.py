@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from seaopt.formatting import format_count, format_number, join_words
@@ -57,6 +58,8 @@ def say_cause(cause: Cause) -> str:
             return f"the command is limited to {value}{unit_after(cause.unit)}"
         case "feedforward":
             return f"the feedforward of the {cause.what} is missing or another one"
+        case "place":
+            return f"the law was given {value}{unit_after(cause.unit)} as {cause.what}"
         case "compensation":
             return f"the compensation of {cause.what} is missing"
         case "part":
@@ -148,6 +151,10 @@ def _say_mismatch(row: Replay, result: Acceptance) -> str:
 def describe(result: Acceptance) -> list[Section]:
     """Return what was compared, what may be the cause where it differs, and what the response says."""
     sections = _describe_replay(result)
+    if result.place is not None:
+        over, value, unit = result.place
+        told = f"The schedule is judged where {over} stood: {format_number(value)}{unit_after(unit)}."
+        sections[0] = replace(sections[0], sentences=(told,))
     if result.response is not None:
         sections.append(_describe_response(result.response, result.left_out))
     if result.differences is not None:

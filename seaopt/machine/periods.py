@@ -85,6 +85,26 @@ def _find_repeated(reference: Float[np.ndarray, " n"], lag: int, size: float) ->
     return np.abs(reference[lag:] - reference[:-lag]) <= SAME * size
 
 
+def _find_stretches(reference: Float[np.ndarray, " n"], period: int) -> list[tuple[int, int]]:
+    """Return where each stretch begins in which periods repeat, and how many are whole."""
+    size, stretches = float(np.ptp(reference)), list[tuple[int, int]]()
+    same = np.concatenate([[False], _find_repeated(reference, period, size), [False]])
+    for first, last in np.flatnonzero(np.diff(same.astype(int))).reshape(-1, 2).tolist():
+        if last - first >= period and np.ptp(reference[first : first + period]) > SAME * size:
+            stretches.append((first, (last - first) // period + 1))
+    return stretches
+
+
+def shorten(ticks: Ticks) -> Ticks:
+    """Return as many periods of each stretch of a log as its response takes without noise."""
+    period = find_period(ticks.reference)
+    assert period is not None
+    stretches = _find_stretches(ticks.reference, period)
+    least = TRANSIENT + (1 if len(stretches) > 1 else 2)
+    rows = [np.arange(first, first + period * min(least, whole)) for first, whole in stretches]
+    return ticks.take(np.concatenate(rows))
+
+
 def cut_periods(controller: Controller, ticks: Ticks) -> Blocks:
     """Return the periods of a log. Raises LogError: its reference does not repeat, or too few periods are whole and
     below the limit of the command.
@@ -95,14 +115,10 @@ def cut_periods(controller: Controller, ticks: Ticks) -> Blocks:
             f"{ticks.source}: its reference does not repeat, so that the loop's response cannot be told from noise; "
             "play a periodic multisine, of at least 3 periods, as the reference"
         )
-    size = float(np.ptp(ticks.reference))
-    same = np.concatenate([[False], _find_repeated(ticks.reference, period, size), [False]])
-    starts: list[tuple[int, int]] = []  # first row, stretch
-    for number, (first, last) in enumerate(np.flatnonzero(np.diff(same.astype(int))).reshape(-1, 2)):
-        whole = (last - first) // period + 1
-        block = ticks.reference[first : first + period]
-        if last - first >= period and np.ptp(block) > SAME * size:
-            starts += [(int(first) + period * k, number) for k in range(TRANSIENT, whole)]
+    stretches = _find_stretches(ticks.reference, period)
+    starts = [  # first row, stretch
+        (first + period * k, number) for number, (first, whole) in enumerate(stretches) for k in range(TRANSIENT, whole)
+    ]
     limit = AT_LIMIT * (controller.command_limit or np.inf)
     free = [pair for pair in starts if np.max(np.abs(ticks.command[pair[0] : pair[0] + period])) < limit]
     if len(free) < 2:

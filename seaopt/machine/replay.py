@@ -24,11 +24,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from seaopt.control import Controller, LawState, RunnableLaw, runnable
+from seaopt.control import Controller, ForceMPC, RunnableLaw, RunnableSchedule, runnable
 from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.errors import SeaoptError
 from seaopt.logs.quality.faults import find_quantisation
+from seaopt.machine.stepped import Setting, Source, State, limit_law, list_starts, make_setting, run_setting
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
@@ -36,6 +37,8 @@ FLOOR = 1e-3  # of the command's variation: a mismatch below is none
 ROUNDING = 2.0  # times the std that rounding leaves by the estimate: a mismatch up to there is rounding
 SIGMAS = 4.0  # of what rounding allows
 HEAD, LEAST_HEAD = 400, 60  # rows that tell the state at the first, and rows within the limit that factors take
+HEAD_DECAYS, LONGEST_HEAD = 3.0, 20000  # time constants of the slowest part that they last besides, and rows at most
+INTEGRATES = 1e-6  # distance from 1 of a pole that does not decay
 LONGEST_RESPONSE = 5000  # rows over which an error of rounding is added up
 WINDOW = 2000  # rows on which causes are tried, about the largest mismatch
 EVERY = (2, 3, 4, 5, 10)  # rows per tick of a law that is slower than the logger
@@ -88,15 +91,6 @@ class Replay:
 
 
 @record(eq=False)
-class Setting:
-    """A law and a log, as they are or as a cause has them."""
-
-    controller: Controller
-    law: RunnableLaw
-    ticks: Ticks
-
-
-@record(eq=False)
 class Alternative:
     """A cause that may be, and what it makes of a setting."""
 
@@ -114,7 +108,6 @@ class Match:
     commands: Float[np.ndarray, " n"]
     allowed: Float[np.ndarray, " n"]
     error: Float[np.ndarray, " n"]
-    start: LawState
 
     @property
     def energy(self) -> float:
@@ -127,11 +120,11 @@ class Match:
         return self.energy <= ROUNDING**2 * float(np.mean(self.allowed**2))
 
 
-def replay(controller: Controller, ticks: Ticks, others: Mapping[str, Controller] | None = None) -> Replay:
-    """Return how a controller's law matches a log, and where it does not, why. `others`: laws that may have run in its
-    place, by name.
+def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None = None) -> Replay:
+    """Return how a law matches a log, and where it does not, why. `others`: laws that may have run in its place, by
+    name.
     """
-    whole = Setting(controller=controller, law=runnable(controller), ticks=ticks)
+    whole = make_setting(source, ticks)
     match = play(whole)
     late, causes = 0, ()
     if not match.met:
@@ -139,11 +132,11 @@ def replay(controller: Controller, ticks: Ticks, others: Mapping[str, Controller
         first = causes[0] if causes else None
         if first is not None and first.kind == "late" and first.what == "command" and first.explains:
             late, causes, match = int(first.value or 0), (), play(changed)
-    rate_hz, law_rate_hz = ticks.rate_hz, 1.0 / controller.sample_time_s
+    rate_hz, law_rate_hz = ticks.rate_hz, 1.0 / whole.controller.sample_time_s
     if match.met and abs(rate_hz / law_rate_hz - 1.0) > SAME_RATE:
         causes = (Cause(kind="rate", what="clock", value=rate_hz, unit="Hz", removes=1.0, explains=True),)
     met = match.met and not causes
-    limit = whole.law.command_limit
+    limit = whole.linear.command_limit
     off = np.flatnonzero(np.abs(match.error) > SIGMAS * match.allowed)
     return Replay(
         met=met,
@@ -163,36 +156,39 @@ def replay(controller: Controller, ticks: Ticks, others: Mapping[str, Controller
 
 def play(setting: Setting) -> Match:
     """Return the commands of a setting's law on its log."""
-    law, ticks = setting.law, setting.ticks
-    head = ticks.take(slice(0, HEAD))
-    allowed = _allow(law, ticks)
-    best, error = law.reset(), np.inf
-    for start in (law.reset(), _rest(law, ticks), _estimate_start(law, head)):
-        off = float(np.mean((_run(law, head, start) - head.command) ** 2))
+    ticks, linear = setting.ticks, setting.linear
+    head = ticks.take(slice(0, _count_head(linear)))
+    allowed = _allow(linear, ticks)
+    allowed_head = allowed[: len(head)]
+    best: tuple[State, int] | None = None
+    error = np.inf
+
+    def starts() -> Iterator[tuple[State, int]]:
+        yield from list_starts(setting)
+        if not isinstance(setting.law, ForceMPC):
+            yield replace(setting.law.reset(), x=_estimate_start(linear, head, allowed_head)), 0
+
+    for start, first in starts():
+        rows = head if not first else ticks.take(slice(first, first + len(head)))
+        off = float(np.mean((run_setting(setting, rows, start) - rows.command) ** 2))
         if off < error:
-            best, error = start, off
-        if error <= np.mean(allowed[: len(head)] ** 2):
+            best, error = (start, first), off
+        if error <= np.mean(allowed_head**2):
             break
-    commands = _run(law, ticks, best)
-    if law.compensation is not None:  # which differences to a row before the first
+    assert best is not None
+    start, first = best
+    commands = np.concatenate([ticks.command[:first], run_setting(setting, ticks.take(slice(first, None)), start)])
+    if linear.compensation is not None:  # which differences to a row before the first
         commands[0] = ticks.command[0]
-    return Match(commands=commands, allowed=allowed, error=commands - ticks.command, start=best)
+    return Match(commands=commands, allowed=allowed, error=commands - ticks.command)
 
 
-def _run(law: RunnableLaw, ticks: Ticks, start: LawState) -> Float[np.ndarray, " n"]:
-    """Return the commands of a law on a log: of its own step where it has guards, else of its matrices, which is as
-    exact and five times as fast.
-    """
-    if law.gate is not None or law.heat is not None:
-        measured = ticks.measured[:, 0] if law.measured == 1 else ticks.measured
-        return law.run(ticks.reference, measured, start, ticks.further)[0]
-    direct, drive = _drive(law, ticks)
-    x, out, most = start.x, np.empty(len(ticks)), law.force_limit_N
-    for k in range(len(ticks)):
-        force = float(law.c @ x) + direct[k]
-        out[k] = min(max(force, -most), most)
-        x = law.a @ x + drive[k] + law.anti_windup * (out[k] - force)
-    return law.per_effort * out
+def _count_head(law: RunnableLaw) -> int:
+    """Return how many rows tell the state at the first: those in which the slowest part of a law decays, too."""
+    size = np.abs(np.linalg.eigvals(law.a)) if law.c.size else np.zeros(0)
+    decays = size[(size > 0.0) & (size < 1.0 - INTEGRATES)]
+    slowest = -1.0 / math.log(float(np.max(decays))) if decays.size else 0.0
+    return int(min(max(HEAD, HEAD_DECAYS * slowest), LONGEST_HEAD))
 
 
 def _drive(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
@@ -211,17 +207,6 @@ def _compensate(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"]
     for k, readings in enumerate(ticks.further[:, : len(law.compensation.reads)].tolist()):
         rows[k, 0], rows[k, 1], memory = law.compensation.step(memory, float(ticks.reference[k]), readings)
     return rows[:, 0], rows[:, 1]
-
-
-def _rest(law: RunnableLaw, ticks: Ticks) -> LawState:
-    """Return the law at rest under the first row, its integral as the first command has it."""
-    first = ticks.measured[0]
-    measured: Any = float(first[0]) if law.measured == 1 else first
-    command = float(np.clip(ticks.command[0], -law.command_limit, law.command_limit))
-    try:
-        return law.reset(float(ticks.reference[0]), measured, command, readings=ticks.further[0].tolist())
-    except SeaoptError:  # a reading outside the gate's range
-        return law.reset()
 
 
 def _find_limited(ticks: Ticks) -> Bool[np.ndarray, " n"]:
@@ -258,14 +243,14 @@ def _follow(
     return law.per_effort * out
 
 
-def _estimate_start(law: RunnableLaw, ticks: Ticks) -> LawState:
+def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
     """Return a state from which the first rows match as well as they can."""
-    limited, start = _find_limited(ticks), law.reset()
+    limited = _find_limited(ticks)
     if np.count_nonzero(~limited) < 3 * max(law.c.size, 1) or not law.c.size:
-        return start
-    left = ticks.command - _follow(law, ticks, limited)
-    shift = np.linalg.lstsq(_find_modes(law, limited)[~limited], left[~limited], rcond=1e-10)[0]
-    return replace(start, x=shift)
+        return np.zeros(law.c.size)
+    left, weight = ticks.command - _follow(law, ticks, limited), 1.0 / allowed[~limited]
+    modes = _find_modes(law, limited)[~limited] * weight[:, None]
+    return np.linalg.lstsq(modes, left[~limited] * weight, rcond=1e-10)[0]
 
 
 def _allow(law: RunnableLaw, ticks: Ticks) -> Float[np.ndarray, " n"]:
@@ -287,9 +272,9 @@ def _allow(law: RunnableLaw, ticks: Ticks) -> Float[np.ndarray, " n"]:
 
 def find_causes(whole: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[tuple[Cause, ...], Setting]:
     """Return the causes that explain a mismatch, the best first, and the setting as the first (and a second) has it."""
-    middle = int(np.argmax(np.abs(match.error)))
-    begin = max(0, min(middle - WINDOW // 2, len(whole.ticks) - WINDOW))
-    window = replace(whole, ticks=whole.ticks.take(slice(begin, begin + WINDOW)))
+    middle, size = int(np.argmax(np.abs(match.error))), max(WINDOW, _count_head(whole.linear))
+    begin = max(0, min(middle - size // 2, len(whole.ticks) - size))
+    window = replace(whole, ticks=whole.ticks.take(slice(begin, begin + size)))
     before = play(window).energy
     if not before:
         return (), whole
@@ -340,6 +325,7 @@ def list_alternatives(setting: Setting, others: Mapping[str, Controller]) -> Ite
     yield from _list_factors(setting)
     yield from _list_of_guards(setting)
     yield from _list_of_gains(setting)
+    yield from _list_places(setting)
     signals = setting.controller.signals
     for name, other in others.items():
         if other.signals == signals:
@@ -405,7 +391,7 @@ def _fit_factors(setting: Setting) -> dict[str, float]:
     """Return the factor of reference, of each reading, and of the command, that fits the logged commands best, each
     by itself; none where the command is at its limit.
     """
-    ticks, law = setting.ticks, setting.law
+    ticks, law = setting.ticks, setting.linear
     limited = _find_limited(ticks)
     free = ~limited
     if np.count_nonzero(free) < LEAST_HEAD:
@@ -427,12 +413,15 @@ def _fit_factors(setting: Setting) -> dict[str, float]:
     return factors
 
 
-def _change_law(**changes: Any) -> Callable[[Setting], Setting]:
-    """Return what changes a law, with the columns of the log that it then reads."""
+def _change_law(*, linear: bool = False, **changes: Any) -> Callable[[Setting], Setting]:
+    """Return what changes a law, or its linear form, with the columns of the log that it then reads."""
 
     def change(setting: Setting) -> Setting:
-        law = replace(setting.law, **changes)
-        read = [setting.law.further.index(name) for name in law.further]
+        before = setting.linear if linear else setting.law
+        law = replace(before, **changes)
+        if isinstance(before, ForceMPC) or isinstance(law, ForceMPC):
+            return replace(setting, law=law)
+        read = [before.further.index(name) for name in law.further]
         return replace(setting, law=law, ticks=replace(setting.ticks, further=setting.ticks.further[:, read]))
 
     return change
@@ -440,24 +429,23 @@ def _change_law(**changes: Any) -> Callable[[Setting], Setting]:
 
 def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
     """Yield limits, guards and terms that are others, or left out."""
-    law, ticks = setting.law, setting.ticks
+    law, linear, ticks = setting.law, setting.linear, setting.ticks
     reached, unit = float(np.max(np.abs(ticks.command))), setting.controller.command.unit
     if not math.isclose(reached, law.command_limit, rel_tol=1e-3):
-        yield Alternative(
-            kind="limit", what="command", value=reached, unit=unit, change=_change_law(command_limit=reached)
-        )
+        change = lambda given: replace(given, law=limit_law(given.law, reached))  # noqa: E731
+        yield Alternative(kind="limit", what="command", value=reached, unit=unit, change=change)
     if law.gate is not None:
         yield Alternative(kind="gate", what="left out", change=_change_law(gate=None))
     if law.heat is not None:
         yield Alternative(kind="heat", what="left out", change=_change_law(heat=None))
-    if np.any(law.anti_windup):
+    if not isinstance(law, ForceMPC) and np.any(law.anti_windup):
         none = np.zeros_like(law.anti_windup)
         yield Alternative(kind="anti-windup", what="left out", change=_change_law(anti_windup=none))
-    added = law.compensation
+    added = linear.compensation
     terms = [] if added is None else [name for name in ("friction", "gravity", "ripple") if getattr(added, name)]
     for name in terms:
         without = replace(added, **{name: None}) if added is not None and len(terms) > 1 else None
-        yield Alternative(kind="compensation", what=name, change=_change_law(compensation=without))
+        yield Alternative(kind="compensation", what=name, change=_change_law(linear=True, compensation=without))
     if setting.controller.link is not None:
         change = _change_ticks(
             lambda rows: replace(rows, measured=rows.measured * _all_but_last(rows.measured.shape[1]))
@@ -476,6 +464,22 @@ def _read_gains(controller: Controller) -> Gains | None:
     return Gains.from_names(controller.gains, controller.observer, controller.speed_loop, controller.link)
 
 
+def _list_places(setting: Setting) -> Iterator[Alternative]:
+    """Yield where a schedule's variable may have been for the law: at a point, or in another unit."""
+    law, place = setting.law, setting.ticks.place
+    if not isinstance(law, RunnableSchedule) or place is None:
+        return
+    points = law.table.points.tolist()
+    over = law.table.over
+    for point in dict.fromkeys([law.fallback, *points]):
+        change = _change_ticks(lambda rows, point=point: replace(rows, place=np.full(len(rows), point)))
+        yield Alternative(kind="place", what=over, value=point, unit=law.table.unit, change=change)
+    for factor in (-1.0, *UNITS):
+        change = _change_ticks(lambda rows, factor=factor: replace(rows, place=factor * rows.place))
+        kind = "sign" if factor < 0.0 else "unit"
+        yield Alternative(kind=kind, what=over, value=factor, change=change)
+
+
 def _make_law(controller: Controller, gains: Gains, sample_time_s: float | None = None) -> Callable[[Setting], Setting]:
     """Return what gives a setting the law of other gains, or of another sample time, with the guards that it has."""
 
@@ -483,7 +487,7 @@ def _make_law(controller: Controller, gains: Gains, sample_time_s: float | None 
         period = sample_time_s or controller.sample_time_s
         law = gains.law(controller.spec.structure, period).balanced()
         made = runnable(replace(controller, law=law))
-        guards = {name: getattr(setting.law, name) for name in ("gate", "heat", "compensation", "command_limit")}
+        guards = {name: getattr(setting.linear, name) for name in ("gate", "heat", "compensation", "command_limit")}
         return replace(setting, law=replace(made, **guards))
 
     return change
@@ -529,14 +533,14 @@ def _fit_gains(setting: Setting, gains: Gains) -> dict[str, float]:
     free = ~limited
     if np.count_nonzero(free) < LEAST_HEAD:
         return {}
-    base, fitted = _follow(setting.law, ticks, limited), dict[str, float]()
-    modes = _find_modes(setting.law, limited)
+    base, fitted = _follow(setting.linear, ticks, limited), dict[str, float]()
+    modes = _find_modes(setting.linear, limited)
     for name in ("k_p", "k_i", "k_d", "k_r"):
         value = getattr(gains, name)
         if not value:
             continue
         changed = _make_law(setting.controller, replace(gains, **{name: 1.01 * value}))(setting)
-        column = (_follow(changed.law, ticks, limited) - base) / (0.01 * value)
+        column = (_follow(changed.linear, ticks, limited) - base) / (0.01 * value)
         table = np.column_stack([column, modes])
         step = np.linalg.lstsq(table[free], (ticks.command - base)[free], rcond=1e-10)[0][0]
         if np.isfinite(step) and value + step > 0.0:

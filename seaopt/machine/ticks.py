@@ -30,19 +30,21 @@ class Ticks:
     measured: Float[np.ndarray, "n y"]
     further: Float[np.ndarray, "n r"]  # what its terms and its gate read besides
     command: Float[np.ndarray, " n"]
+    place: Float[np.ndarray, " n"] | None = None  # of a schedule, its variable
     left_out: int = 0  # rows of the log that are in no such stretch
 
     def __len__(self) -> int:
         return self.command.size
 
-    def take(self, rows: slice, *, command: slice | None = None, measured: slice | None = None) -> Ticks:
-        """Return some rows; with the command, or the readings, of other rows."""
+    def take(self, rows: Any, *, command: slice | None = None, measured: slice | None = None) -> Ticks:
+        """Return some rows, a slice or numbers; with the command, or the readings, of other rows."""
         read = rows if measured is None else measured
         return replace(
             self,
             reference=self.reference[rows],
             measured=self.measured[read],
             further=self.further[read],
+            place=None if self.place is None else self.place[read],
             command=self.command[rows if command is None else command],
         )
 
@@ -63,14 +65,22 @@ class Ticks:
         return self.take(slice(phase, None, every))
 
     @property
+    def middle(self) -> float | None:
+        """Where a schedule's variable is as a rule."""
+        return None if self.place is None else float(np.median(self.place))
+
+    @property
     def quantum(self) -> float:
         """The step of the logged command; 0 where none is seen."""
         return find_quantisation(self.command)
 
 
-def take_ticks(controller: Controller, log: Log, reference: str | None = None) -> Ticks:
+def take_ticks(
+    controller: Controller, log: Log, reference: str | None = None, over: str | None = None, at: float | None = None
+) -> Ticks:
     """Return the ticks of a log whose channels carry the names of the controller's signals, of the input that it
-    commands, and of its reference. Raises LogError: a channel is missing, or no stretch is long enough.
+    commands, and of its reference. `over`: the variable of its schedule, which was `at` a value where the log does not
+    have it. Raises LogError: a channel is missing, or no stretch is long enough.
     """
     command, names = controller.command, (*controller.signals, *controller.further)
     called = [reference] if reference is not None else [name for name in REFERENCES if name in log.signals]
@@ -86,7 +96,13 @@ def take_ticks(controller: Controller, log: Log, reference: str | None = None) -
             f"{log.source}: has no {join_words(missing)}, {what}; log in each tick {join_words(names)} as the law was "
             f"given them, and {command.input} as it returned it"
         )
-    columns = [log[name] for name in (called[0], command.input, *names)]
+    if over is not None and over not in log.signals and at is None:
+        raise LogError(
+            f"{log.source}: has no {over}, over which the law is scheduled; log it in each tick as the law was given "
+            "it, or say where it stood: --at VALUE"
+        )
+    placed = over is not None and over in log.signals
+    columns = [log[name] for name in (called[0], command.input, *names, *([over] if placed and over else []))]
     table = np.column_stack(columns)
     rows = _find_longest(log, np.all(np.isfinite(table), axis=1))
     if rows.stop - rows.start < FEWEST:
@@ -95,13 +111,15 @@ def take_ticks(controller: Controller, log: Log, reference: str | None = None) -
             f"{join_words(names)}; log at least {FEWEST} ticks without a gap, better some periods of the reference"
         )
     table, count = table[rows], len(controller.signals)
+    place = table[:, -1] if placed else None if over is None else np.full(len(table), at)
     return Ticks(
         source=log.source,
         rate_hz=log.rate_hz,
         reference=table[:, 0],
         command=table[:, 1],
         measured=table[:, 2 : 2 + count],
-        further=table[:, 2 + count :],
+        further=table[:, 2 + count : 2 + len(names)],
+        place=place,
         left_out=len(log) - len(table),
     )
 

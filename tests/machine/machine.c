@@ -3,7 +3,21 @@
  *   M q'' = kF i - b q' - f_c tanh(q'/v_s) - k q - s,  F = k q,  s = k2 (q - q2) + c2 (q' - q2'),  m2 q2'' = s
  * with i the command that is in force: of tick j from (j + late) T + delay on. */
 #include <math.h>
+#ifdef PLAN /* predictive control */
+#include "force_mpc.h"
+#define LAW force_mpc
+#define START(law) force_mpc_reset(law)
+#define STEP(law, r, y, place) force_mpc_step(law, r, y)
+#else
 #include "force_law.h"
+#define LAW force_law_law
+#define START(law) force_law_init(law)
+#ifdef PLACED /* scheduled */
+#define STEP(law, r, y, place) force_law_step(law, r, y, place)
+#else
+#define STEP(law, r, y, place) force_law_step(law, r, y)
+#endif
+#endif
 
 typedef struct {
     double mass, damping, stiffness, per_ampere, coulomb, smoothing; /* M, b, k, kF, f_c, v_s */
@@ -34,21 +48,22 @@ static void advance(const machine *m, double *x, double i, double h)
     for (j = 0; j < 4; j++) x[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j]);
 }
 
-/* Run n ticks of `period` seconds; `force` is what the sensor showed, `current` what the firmware sent. */
+/* Run n ticks of `period` seconds; `force` is what the sensor showed, `current` what the firmware sent, `place` where a
+ * schedule's variable was said to be. */
 void run(const machine *m, long n, long steps, double period, const double *reference, const double *noise,
-         double *force, double *current)
+         const double *place, double *force, double *current)
 {
-    force_law_law law;
+    static LAW law;
     double x[4] = {0, 0, 0, 0}, u = 0.0;
     long k, j, every = (long)m->every;
-    force_law_init(&law);
+    START(&law);
     for (k = 0; k < n; k++) {
         double reading = m->stiffness * x[0] + noise[k];
         if (m->force_step > 0) reading = m->force_step * floor(reading / m->force_step + 0.5);
         if (reading > m->sensor_range) reading = m->sensor_range;
         if (reading < -m->sensor_range) reading = -m->sensor_range;
         if (k % every == 0) {
-            u = m->law_gain * force_law_step(&law, reference[k], m->reading_sign * reading);
+            u = m->law_gain * STEP(&law, reference[k], m->reading_sign * reading, place[k]);
             if (m->current_step > 0) u = m->current_step * floor(u / m->current_step + 0.5);
         }
         force[k] = reading;

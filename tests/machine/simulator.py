@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import seaopt as so
+from seaopt.control import ForceMPC, ScheduledController, export_mpc
 
 SOURCE = Path(__file__).with_name("machine.c")
 STEPS = 20  # integration steps per tick
@@ -39,6 +40,20 @@ class Machine:
     force_step: float = 0.0
     every: float = 1.0
 
+    @classmethod
+    def of_knee(cls, values) -> Machine:
+        """Return a locked rotary actuator, as it is seen at its output: N^2 J_m, N^2 b_r, N eta K_tau per ampere."""
+        at = {name: parameter.value for name, parameter in values.items()}
+        gear = at["N"]
+        return cls(
+            mass=gear**2 * at["J_m"],
+            damping=gear**2 * at["b_r"],
+            stiffness=at["k_s"],
+            per_ampere=gear * at["eta"] * at["K_tau"],
+            coulomb=gear * at["f_c"],
+            smoothing=at["v_s"] / gear,
+        )
+
     def with_mode(self, frequency_hz: float, share: float = 0.15, damping: float = 0.03) -> Machine:
         """Return the machine with a mass on a spring at the nut, tuned to a frequency."""
         m2, w = share * self.mass, 2.0 * math.pi * frequency_hz
@@ -50,28 +65,53 @@ class Bench:
 
     def __init__(self, compiler, folder, controller, name="law"):
         self.controller, self.folder = controller, Path(folder) / name
-        so.export(controller, self.folder, allow_infeasible=True)
+        kind = []
+        if isinstance(controller, ForceMPC):
+            export_mpc(controller, self.folder)
+            kind = ["-DPLAN"]
+        else:
+            so.export(controller, self.folder, allow_infeasible=True)
+        if isinstance(controller, ScheduledController):
+            kind = ["-DPLACED"]
         library = self.folder / "machine.so"
-        sources = [str(self.folder / "force_law.c"), str(SOURCE)]
-        flags = ["-O2", "-std=c99", "-ffp-contract=off", "-shared", "-fPIC", f"-I{self.folder}"]
+        sources = [*map(str, sorted(self.folder.glob("*.c"))), str(SOURCE)]
+        flags = ["-O2", "-std=c99", "-ffp-contract=off", "-shared", "-fPIC", *kind, f"-I{self.folder}"]
         subprocess.run([*compiler, *flags, *sources, "-lm", "-o", str(library)], check=True, capture_output=True)
         self._run = ctypes.CDLL(str(library)).run
 
-    def log(self, machine, reference, *, noise=2.0, seed=1, period=None, decimals=None):
-        """Return the log of a run: the law's clock is `period`, its sample time if left out."""
-        period = period or self.controller.sample_time_s
+    @property
+    def signal(self):
+        """What is regulated, and its unit."""
+        law = self.controller
+        if isinstance(law, ForceMPC):
+            return law.measured, law.actuation.reference_unit
+        first = law.controllers[0] if isinstance(law, ScheduledController) else law
+        return first.signals[0], first.command.reference_unit
+
+    def log(self, machine, reference, *, noise=2.0, seed=1, period=None, decimals=None, places=None):
+        """Return the log of a run: the law's clock is `period`, its sample time if left out; `places`: of a schedule,
+        its variable in each tick.
+        """
+        law = self.controller
+        period = period or (law.table if isinstance(law, ScheduledController) else law).sample_time_s
         n = reference.size
         reference = np.ascontiguousarray(reference, dtype=float)
         errors = noise * np.random.default_rng(seed).normal(size=n)
-        force, current = np.zeros(n), np.zeros(n)
+        place, force, current = np.zeros(n) if places is None else places.copy(), np.zeros(n), np.zeros(n)
         numbers = (ctypes.c_double * len(fields(machine)))(*(getattr(machine, f.name) for f in fields(machine)))
-        pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (reference, errors, force, current)]
+        pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (reference, errors, place, force, current)]
         self._run(numbers, ctypes.c_long(n), ctypes.c_long(STEPS), ctypes.c_double(period), *pointers)
         if decimals is not None:
             force, current = np.round(force, decimals), np.round(current, decimals + 2)
-        units = {"reference": "N", "I": "A", "F1": "N"}
-        time = period * np.arange(n)
-        return so.Log.from_arrays(time=time, reference=reference, I=current, F1=force, units=units, source="bench")
+        name, unit = self.signal
+        columns = {"time": period * np.arange(n), "reference": reference, "I": current, name: force}
+        units = {"reference": unit, "I": "A", name: unit}
+        if places is not None:
+            columns, units = (
+                columns | {self.controller.over: places},
+                units | {self.controller.over: self.controller.unit},
+            )
+        return so.Log.from_arrays(**columns, units=units, source="bench")
 
 
 def multisine(period, lines, periods, amplitude, seed, bias=0.0):

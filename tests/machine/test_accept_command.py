@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 import seaopt as so
@@ -74,7 +75,35 @@ def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
     assert content["replay"]["logs"][1]["causes"][0]["kind"] == "factor"
 
 
-def test_a_schedule_is_refused_with_what_to_do_in_python(folder, monkeypatch, accept):
+def test_bring_up_of_a_schedule_is_refused_with_what_to_do_in_python(folder, monkeypatch):
+    from typer.testing import CliRunner
+
     schedule = SimpleNamespace(over="I_p", points=(0.2, 0.6))
     monkeypatch.setattr(Session, "law", lambda session: schedule)
-    assert "so.accept(schedule.at(0.2), [log])" in str(accept(folder / "good.csv").exception)
+    done = CliRunner().invoke(app, ["bringup", str(folder / "stand.toml"), "-o", str(folder / "out")])
+    assert "so.bring_up(schedule.at(0.2), ...)" in str(done.exception)
+
+
+SCHEDULED = PROBLEM.replace("9.0 }", '9.0, schedule = { over = "k", points = [5e5, 8e5] } }').replace("= 30", "= 25")
+
+
+def test_a_schedule_is_accepted_at_the_value_that_is_typed(compiler, tmp_path):
+    from typer.testing import CliRunner
+
+    from seaopt.control import ScheduledController
+
+    (tmp_path / "stand.toml").write_text(SCHEDULED)
+    arguments = [str(tmp_path / "stand.toml"), "-o", str(tmp_path / "out")]
+    CliRunner().invoke(app, ["tune", *arguments])
+    content = json.loads((tmp_path / "out" / "controller.json").read_text())
+    problem = so.read_problem(tmp_path / "stand.toml")
+    schedule = ScheduledController.from_dict(content, problem.design_plant, problem.values(problem.parameters))
+    bench, reference = Bench(compiler, tmp_path, schedule), multisine(1000, LINES, 8, 60.0, 3, bias=300.0)
+    log = bench.log(Machine(), reference, places=np.full(reference.size, Machine().stiffness))
+    bare = so.Log.from_arrays(**{name: log[name] for name in ("reference", "I", "F1")}, time=log.time)
+    so.write_log(bare, tmp_path / "log.csv")
+    done = CliRunner().invoke(
+        app, ["accept", arguments[0], str(tmp_path / "log.csv"), *arguments[1:], "--at", "655000"]
+    )
+    assert done.exit_code == 0, done.output
+    assert json.loads((tmp_path / "out" / "acceptance.json").read_text())["place"]["over"] == "k"

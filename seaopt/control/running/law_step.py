@@ -8,8 +8,10 @@ since, the temperatures, the place of a schedule, and the last command, which is
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import reduce
+from dataclasses import replace
+from functools import lru_cache, reduce
 from operator import add, mul
+from threading import get_ident
 from typing import Any
 
 import casadi as ca
@@ -22,8 +24,10 @@ from seaopt.control.loops.compensation.terms import CompensationShape, compensat
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleShape, ScheduleState
 from seaopt.plants.motor.heat_guard import HEAT_NUMBERS, limit_current, warm_winding
 from seaopt.records import record
+from seaopt.simulation.direct_call import DirectCall
 
 GATE_NUMBERS = 5
+CHUNK = 500  # samples that a law is run over in one call
 
 
 @record
@@ -121,6 +125,41 @@ def find_faults(law: RunnableLaw | RunnableSchedule, kept: Float[np.ndarray, "ru
     if law.gate is None:
         return np.zeros(len(kept), dtype=bool)
     return kept[:, sum(shape.sizes[:3]) - 1] > law.gate.max_held
+
+
+def run_law(
+    law: RunnableLaw | RunnableSchedule,
+    references: Float[np.ndarray, " n"],
+    measured: Float[np.ndarray, "n y"],
+    further: Float[np.ndarray, "n r"],
+    places: Float[np.ndarray, " n"] | None,
+    start: LawState,
+) -> Float[np.ndarray, " n"]:
+    """Return the commands of a law over samples whose inputs are numbers, by the step that the compiled loop runs.
+    `further`: what its terms read; `places`: of a schedule, its variable.
+    """
+    shape = replace(LawShape.of_law(law), holds=law.gate is not None)
+    run, numbers = _chain_steps(shape, get_ident()), np.tile(list_numbers(law), CHUNK)
+    kept, n = list_kept(law, start), references.size
+    signals = (references[:, None], measured, further, np.zeros((n, 0)) if places is None else places[:, None])
+    out = np.empty(n)
+    for first in range(0, n, CHUNK):
+        at = np.minimum(np.arange(first, first + CHUNK), n - 1)  # the last chunk is filled up
+        after, commands = run(kept, numbers, *(signal[at].ravel() for signal in signals))
+        out[first : first + CHUNK] = commands[0, : n - first]
+        kept = after[:, -1]
+    return out
+
+
+@lru_cache(maxsize=16)
+def _chain_steps(shape: LawShape, _thread: int) -> DirectCall:
+    """Return the steps of a chunk in a row, which a thread has to itself: what is kept after each, and the commands."""
+    kept, numbers = ca.SX.sym("kept", shape.kept), ca.SX.sym("numbers", sum(shape.number_sizes))
+    r, y = ca.SX.sym("r"), ca.SX.sym("y", shape.measured)
+    more, place = ca.SX.sym("w", len(shape.further)), ca.SX.sym("place", int(shape.schedule is not None))
+    command, after = express_step(shape, numbers, kept, r, ca.vertsplit(y), ca.vertsplit(more), place)
+    step = ca.Function("step", [kept, numbers, r, y, more, place], [ca.densify(after), ca.densify(command)])
+    return DirectCall(step.mapaccum(CHUNK))
 
 
 def _is_number(value: Any) -> Any:

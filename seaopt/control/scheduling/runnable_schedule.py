@@ -7,7 +7,7 @@ A scheduling variable that is not finite, or beyond 1e15, is not used: the last 
 `fallback` where there was none since the reset.
 
 Law and gains of a place are an expression of CasADi (`ScheduleShape`), which runs here in its virtual machine, compiled
-in the loops of `seaopt.control.running`. Where the variable stands still the law is linear, and `hold` returns it so.
+in the loops of `seaopt.control.running`. Where the variable stands still the law is linear, and `freeze` returns it so.
 """
 
 from __future__ import annotations
@@ -178,6 +178,33 @@ class RunnableSchedule(Guarded):
         )
         return ScheduleState(
             x=np.array(list(x.values())), current_A=current_A, gate=seen, heat=heat, place=at, misplaced=int(missing)
+        )
+
+    def freeze(self, place: float, compensation: Compensation | None = None) -> RunnableLaw:
+        """Return the law while the variable stands at a value, with the states that it has here. `compensation`: the
+        terms that it has there.
+        """
+        run, n, y = _compile_step(self, get_ident()), len(self.table.states), self.measured
+
+        def respond(x: Any, reference: float, read: Any, most: float, added: float) -> Float[np.ndarray, " m"]:
+            effort, _, after = run(place, x, reference, read, most, added)
+            return np.concatenate([after[:, 0], effort[0]])
+
+        unit, still, nothing = np.eye(n + 1 + y), np.zeros(n), np.zeros(y)
+        columns = np.array([respond(row[:n], row[n], row[n + 1 :], math.inf, 0.0) for row in unit]).T
+        wound = respond(still, 0.0, nothing, 0.0, 1.0) - respond(still, 0.0, nothing, math.inf, 1.0)
+        kept = {field.name: getattr(self, field.name) for field in fields(Guarded)} | {"compensation": compensation}
+        return RunnableLaw(
+            **kept,
+            a=columns[:n, :n],
+            b_reference=columns[:n, n],
+            b_measurement=-columns[:n, n + 1] if y == 1 else -columns[:n, n + 1 :],
+            c=columns[n, :n],
+            d_reference=float(columns[n, n]),
+            d_measurement=-float(columns[n, n + 1]) if y == 1 else -columns[n, n + 1 :],
+            anti_windup=-wound[:n],
+            integrators=0,
+            tracking_time_s=None,
         )
 
     def step(

@@ -1,0 +1,119 @@
+"""Acceptance of schedules and of predictive control: the exported C on a machine that shares nothing with seaopt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.control import LawState, MPCSpec, force_mpc, runnable, tune_schedule
+from seaopt.control.running.law_step import run_law
+from tests.machine.simulator import Bench, Machine, multisine
+from tests.machine.test_response import LINES, REFERENCE, respond
+
+STAND, THOR = so.plants.high_impedance(), so.plants.thor()
+SOFT = replace(Machine(), stiffness=5.5e5)
+
+
+@pytest.fixture(scope="module")
+def schedule():
+    spec = so.ControllerSpec(bandwidth_hz=25, max_sensitivity=1.6, current_limit_A=9.0)
+    return tune_schedule(STAND, THOR, spec, "k", [5e5, 8e5])
+
+
+@pytest.fixture(scope="module")
+def scheduled(compiler, tmp_path_factory, schedule):
+    return Bench(compiler, tmp_path_factory.mktemp("schedule"), schedule)
+
+
+def test_a_schedule_is_judged_where_its_variable_stood(schedule, scheduled):
+    log = scheduled.log(SOFT, REFERENCE, places=np.full(REFERENCE.size, 5.5e5)).between(0.3, 9.9)
+    result = so.accept(schedule, [log])
+    assert result.met and result.place == ("k", 5.5e5, "N/m") and result.differences.misfit < 2.0, result
+    assert result.controller.spec == schedule.at(5.5e5).spec
+    noiseless = so.accept(schedule, [scheduled.log(SOFT, REFERENCE, noise=0.0, places=np.full(REFERENCE.size, 5.5e5))])
+    (part,) = noiseless.response.measured
+    loop, _ = respond(SOFT, part.f, schedule.at(5.5e5), 1)
+    assert np.allclose(part.loop.value, loop, rtol=1e-4)
+    stiff = so.accept(schedule, [scheduled.log(Machine(), REFERENCE, places=np.full(REFERENCE.size, 5.5e5))])
+    assert stiff.replayed and not stiff.met and stiff.differences.found[0].name == "k", stiff
+
+
+def test_a_schedule_whose_variable_moves_is_replayed_and_has_no_response(schedule, scheduled):
+    places = np.linspace(5e5, 8e5, REFERENCE.size)
+    result = so.accept(schedule, [scheduled.log(Machine(), REFERENCE, places=places, decimals=2)])
+    assert result.replayed and result.response is None and "hold it at a value" in result.left_out["bench"]
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "value"), [(5e5, "place", 5e5), (8e5, "place", 8e5), (5.5e8, "place", 8e5), (6.0e2, "place", 5e5)]
+)
+def test_a_schedule_that_was_given_another_place_is_named(schedule, scheduled, given, kind, value):
+    log = scheduled.log(SOFT, REFERENCE, places=np.full(REFERENCE.size, given))
+    log = so.Log.from_arrays(
+        **{name: log[name] for name in ("reference", "I", "F1")}, time=log.time, k=np.full(REFERENCE.size, 6.5e5)
+    )
+    (row,) = so.accept(schedule, [log]).replays
+    assert (row.causes[0].kind, row.causes[0].what, row.causes[0].value) == (kind, "k", value)
+
+
+def test_where_a_schedule_stood_is_said_or_asked_for(schedule, scheduled):
+    log = scheduled.log(SOFT, REFERENCE, places=np.full(REFERENCE.size, 5.5e5))
+    bare = so.Log.from_arrays(**{name: log[name] for name in ("reference", "I", "F1")}, time=log.time)
+    assert so.accept(schedule, [bare], at=5.5e5).replayed
+    with pytest.raises(so.SeaoptError, match="--at VALUE"):
+        so.accept(schedule, [bare])
+    with pytest.raises(so.SeaoptError, match="from 500000 to 800000"):
+        so.accept(schedule, [bare], at=0.55)
+    other = scheduled.log(SOFT, REFERENCE, places=np.full(REFERENCE.size, 7e5))
+    with pytest.raises(so.SeaoptError, match="by themselves"):
+        so.accept(schedule, [log, other])
+    with pytest.raises(so.SeaoptError, match="not scheduled"):
+        so.accept(schedule.at(6e5), [bare], at=6e5)
+
+
+def test_a_law_steps_over_a_log_as_by_itself(schedule):
+    rng, n = np.random.default_rng(1), 700
+    r, y = (2000.0 * rng.normal(size=n) for _ in range(2))
+    law, place = schedule.runnable(), 6e5
+    commands = run_law(law, r, y[:, None], np.zeros((n, 0)), np.full(n, place), law.reset(place=place))
+    state, expected = law.reset(place=place), np.empty(n)
+    for k in range(n):
+        expected[k], state = law.step(state, r[k], y[k], place)
+    np.testing.assert_allclose(commands, expected, rtol=0, atol=1e-12)
+    frozen = law.freeze(place)
+    at_rest = LawState(x=np.zeros(frozen.c.size))
+    np.testing.assert_allclose(run_law(frozen, r, y[:, None], np.zeros((n, 0)), None, at_rest), expected, atol=1e-11)
+    np.testing.assert_allclose(runnable(schedule.at(place)).run(r, y)[0], expected, atol=1e-11)
+
+
+@pytest.fixture(scope="module")
+def planned(compiler, tmp_path_factory):
+    mpc = force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
+    return Bench(compiler, tmp_path_factory.mktemp("mpc"), mpc)
+
+
+SHORT = multisine(1000, LINES, 4, 60.0, 3, bias=300.0)
+
+
+@pytest.mark.slow
+def test_predictive_control_is_replayed_and_judged_and_its_fault_is_named(planned):
+    mpc = planned.controller
+    log = planned.log(Machine(), SHORT)
+    right = so.accept(mpc, [log.between(0.7, 4.0)])
+    assert right.replayed and right.replays[0].mismatch < 1e-6, right
+    response = so.accept(mpc, [log]).response
+    loop, _ = respond(Machine(), response.measured[0].f, right.controller, mpc.compute_delay_samples)
+    centre, radius = response.measured[0].loop.disc(0.05)
+    assert np.mean(np.abs(centre - loop) <= radius) > 0.8
+    half = so.accept(mpc, [planned.log(Machine(law_gain=0.5), SHORT[:1000])])
+    assert (half.replays[0].causes[0].kind, half.replays[0].causes[0].what) == ("factor", "I")
+
+
+def test_predictive_control_at_its_limits_is_replayed(planned):
+    jump = np.where(np.arange(800) % 400 < 200, 0.0, 2400.0)
+    log = planned.log(Machine(), jump)
+    (row,) = so.accept(planned.controller, [log]).replays
+    assert row.met and row.saturated > 0.02 and row.largest < 1e-6
