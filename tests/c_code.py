@@ -12,6 +12,7 @@ from seaopt.control import export_mpc
 from seaopt.control.deploy.export import export
 
 STRICT = ["-Wall", "-Wextra", "-Werror", "-std=c99", "-pedantic"]
+CONVERSIONS = ["-Wconversion", "-Wsign-conversion", "-Wdouble-promotion", "-Wshadow"]
 
 
 class LoadedLaw:
@@ -139,3 +140,42 @@ class CompiledMPC(LoadedMPC):
 
     def __init__(self, compiler, folder, mpc, **options):
         super().__init__(compiler, export_mpc(mpc, folder, **options))
+
+
+class CompiledLog:
+    """A law with its log, compiled strictly, through ctypes."""
+
+    def __init__(self, compiler, folder, controller, rows, precision="double", **options):
+        export(controller, folder, name="law", log_rows=rows, precision=precision, **options)
+        made = folder / "log.so"
+        command = [*compiler, *STRICT, *CONVERSIONS, "-O2", "-shared", "-fPIC", folder / "law.c", folder / "law_log.c"]
+        done = subprocess.run([*command, "-o", made], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        self.library = ctypes.CDLL(str(made))
+        header = (folder / "law_log.h").read_text()
+        stated = {name: int(value) for name, value in re.findall(r"#define LAW_LOG_(\w+) (\d+)UL", header)}
+        self.bytes, self.row_bytes = stated["BYTES"], stated["ROW_BYTES"]
+        self.real = ctypes.c_double if precision == "double" else ctypes.c_float
+        self.ring = (ctypes.c_uint32 * (self.bytes // 4))()
+        self.header = bytes((ctypes.c_char * stated["HEADER_BYTES"]).in_dll(self.library, "law_log_header"))
+        self.library.law_log_init(self.ring)
+
+    def push(self, status, *values):
+        return self.library.law_log_push(self.ring, status, *map(self.real, values))
+
+    def drain(self, size):
+        into = ctypes.create_string_buffer(size)
+        count = self.library.law_log_drain(self.ring, into, ctypes.c_uint32(size))
+        return into.raw[:count]
+
+    @property
+    def hash(self):
+        return re.search(b'"hash": "([0-9a-f]+)"', self.header)[1]
+
+    @property
+    def overruns(self):
+        return self.ring[2]
+
+    def file(self, path, rows):
+        path.write_bytes(self.header + rows)
+        return path

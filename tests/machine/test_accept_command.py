@@ -11,6 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.cli.main import app
 from seaopt.cli.session import Session
+from tests.c_code import CompiledLog
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
 
@@ -36,6 +37,14 @@ def folder(compiler, tmp_path_factory):
     bench, reference = Bench(compiler, home, controller), multisine(1000, LINES, 8, 60.0, 3, bias=300.0)
     so.write_log(bench.log(Machine(), reference, decimals=3), home / "good.csv")
     so.write_log(bench.log(Machine(law_gain=0.5), reference, decimals=3), home / "half.csv")
+    ring, log = CompiledLog(compiler, home, controller, 512), so.read_log(home / "good.csv")
+    rows = b""
+    for row in np.column_stack([log["reference"], log["F1"], log["I"]]):
+        ring.push(0, *row)
+        rows += ring.drain(ring.row_bytes)
+    ring.file(home / "good.sealog", rows)
+    (home / "other.sealog").write_bytes(ring.header.replace(ring.hash, b"0123456789abcdef") + rows)
+    (home / "cut.sealog").write_bytes(ring.header[:-9])
     bare = (home / "good.csv").read_text().replace(" [N]", "").replace(" [A]", "").replace("reference", "goal")
     (home / "bare.csv").write_text(bare)
     return home
@@ -59,6 +68,14 @@ def test_a_log_of_this_law_is_accepted(folder, accept):
     content = json.loads((folder / "out" / "acceptance.json").read_text())
     assert content["schema"] == "seaopt/acceptance/1" and content["met"] and content["replay"]["met"]
     assert "Replay" in (folder / "out" / "acceptance.html").read_text()
+
+
+def test_a_log_of_the_target_is_taken_as_it_is(folder, accept):
+    assert accept(folder / "good.sealog").exit_code == 0
+    other = accept(folder / "other.sealog")
+    assert other.exit_code == 1 and "another, 0123456789abcdef" in other.output
+    cut = accept(folder / "cut.sealog")
+    assert "header is cut off or damaged" in str(cut.exception)
 
 
 def test_columns_without_units_and_with_other_names_are_read(folder, accept):

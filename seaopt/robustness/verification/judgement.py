@@ -282,7 +282,7 @@ def _judge_extremes(run: _Run, findings: _Findings) -> None:
         contact_loss_J=None if hardest is None else float(hardest.loss_J[index]),
     )
     if trace.faulted[index]:
-        remedy = "a larger max_step_N, max_held or range_N in [controller.gate]"
+        remedy = "a larger max_step_N, max_held or range_N in [controller.gate], or no agreement"
         findings.faults.append(Fault(kind="gate", text="the gate takes a true reading for a fault", remedy=remedy))
     if np.max(current) > most * (1 + 1e-9):
         reached = f"the {command.word} reaches {command.show(np.max(current))}"

@@ -14,18 +14,20 @@ import pytest
 
 from seaopt.control import MPCSpec, PlausibilityGate, export_mpc, force_mpc
 from seaopt.control.deploy.export import export
+from seaopt.control.laws.plausibility import Agreement
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.loops.compensation.ripple_term import RippleTerm
 from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import ControlError
 from seaopt.plants.motor.heat_guard import HeatGuard
-from tests.c_code import STRICT, CompiledLaw, CompiledMPC
+from tests.c_code import CONVERSIONS, STRICT, CompiledLaw, CompiledMPC
 from tests.control.deploy.test_schedule_export import CompiledSchedule
 from tests.schedules import tune_knee
 
 TS = 1e-3
 GATE = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=5, ramp_A_per_s=90.0)
+AGREEING = replace(GATE, agreement=Agreement(reads=("q", "phi"), weights=(655e3, -4e4), limit=12.0, share=0.02))
 HEAT = HeatGuard(
     a_11=0.99, a_12=0.01, a_21=0.001, a_22=0.998, b_1=0.005, b_2=0.0, resistance=0.7, slope=0.003, allowed_rise=99.0,
     share=0.01, ambient=21.0,
@@ -40,7 +42,6 @@ EVERYTHING = Compensation(
 )  # fmt: skip
 FINITE = [0.0, -0.0, 5e-324, -5e-324, 1e-308, -2e-308, 1.0000001e15, -1e16, 1e154, -1e300, 1.7e308, -1.7e308]
 EXTREME = [*FINITE, np.nan, np.inf, -np.inf]
-CHECKS = ["-Wconversion", "-Wsign-conversion", "-Wdouble-promotion", "-Wshadow"]
 DEVIATIONS = {"2.4", "2.5", "8.7", "8.9", "14.1", "15.5"}  # docs/howto/on_the_target.md has the reasons
 
 
@@ -61,7 +62,7 @@ def sources(tuned, mpc, tmp_path_factory):
         at = folder / precision
         export(tuned, at / "plain", name="law", precision=precision)
         export(tuned, at / "gated", name="law", precision=precision, gate=GATE)
-        export(whole, at / "whole", name="law", precision=precision, gate=GATE, derate=HEAT)
+        export(whole, at / "whole", name="law", precision=precision, gate=AGREEING, derate=HEAT)
         export_mpc(mpc, at / "mpc", single_precision=precision == "float")
     return folder
 
@@ -107,7 +108,7 @@ def test_with_the_flag_of_the_header_nothing_is_fused(name, file, sources):
 @pytest.mark.parametrize("file", LAWS)
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_no_conversion_is_implicit(precision, file, compiler, sources):
-    done = compile_file(compiler, sources / precision / file / "law.c", *STRICT, *CHECKS)
+    done = compile_file(compiler, sources / precision / file / "law.c", *STRICT, *CONVERSIONS)
     assert done.returncode == 0, done.stderr
 
 
@@ -132,7 +133,7 @@ def test_misra_deviations_are_those_that_the_documentation_lists(file, sources):
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_a_schedule_keeps_the_same_rules(precision, compiler, tmp_path):
     export(tune_knee(), tmp_path, name="law", precision=precision)
-    done = compile_file(compiler, tmp_path / "law.c", *STRICT, *CHECKS)
+    done = compile_file(compiler, tmp_path / "law.c", *STRICT, *CONVERSIONS)
     assert done.returncode == 0, done.stderr
     done = compile_file(compiler, tmp_path / "law.c", "-ffinite-math-only")
     assert "compile without -ffast-math and -ffinite-math-only" in done.stderr

@@ -12,7 +12,7 @@ from seaopt.control.deploy.export import export
 from seaopt.control.deploy.target import Tare
 from seaopt.control.laws.plausibility import SIGMAS
 from seaopt.errors import ControlError
-from tests.c_code import STRICT
+from tests.c_code import CONVERSIONS, STRICT
 
 NOISE, LIMIT, COUNT = 2.0, 50.0, 500
 BUSY, DONE, MOVED, BEYOND = range(4)
@@ -38,7 +38,7 @@ def tare(compiler, tuned, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tare")
     export(tuned, folder, name="law", tare=Tare(noise=NOISE, limit=LIMIT, duration_s=0.5))
     (folder / "driver.c").write_text(DRIVER)
-    flags = [*STRICT, "-Wconversion", "-Wsign-conversion", "-Wshadow", "-O2", "-shared", "-fPIC"]
+    flags = [*STRICT, *CONVERSIONS, "-O2", "-shared", "-fPIC"]
     command = [*compiler, *flags, folder / "driver.c", folder / "law_tare.c", "-o", folder / "tare.so"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

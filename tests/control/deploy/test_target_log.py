@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
-import re
 import subprocess
 from dataclasses import replace
 
@@ -19,46 +17,10 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError, LogError
 from seaopt.files import to_json
 from seaopt.logs import contents
-from tests.c_code import STRICT
+from tests.c_code import CompiledLog
 from tests.schedules import tune_knee
 
-CHECKS = ["-Wconversion", "-Wsign-conversion", "-Wdouble-promotion", "-Wshadow"]
 CLOSED = "reference", "F1", "I"
-
-
-class CompiledLog:
-    """A law with its log, compiled strictly, through ctypes."""
-
-    def __init__(self, compiler, folder, controller, rows, precision="double", **options):
-        export(controller, folder, name="law", log_rows=rows, precision=precision, **options)
-        made = folder / "log.so"
-        command = [*compiler, *STRICT, *CHECKS, "-O2", "-shared", "-fPIC", folder / "law.c", folder / "law_log.c"]
-        done = subprocess.run([*command, "-o", made], capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        self.library = ctypes.CDLL(str(made))
-        header = (folder / "law_log.h").read_text()
-        stated = {name: int(value) for name, value in re.findall(r"#define LAW_LOG_(\w+) (\d+)UL", header)}
-        self.bytes, self.row_bytes = stated["BYTES"], stated["ROW_BYTES"]
-        self.real = ctypes.c_double if precision == "double" else ctypes.c_float
-        self.ring = (ctypes.c_uint32 * (self.bytes // 4))()
-        self.header = bytes((ctypes.c_char * stated["HEADER_BYTES"]).in_dll(self.library, "law_log_header"))
-        self.library.law_log_init(self.ring)
-
-    def push(self, status, *values):
-        return self.library.law_log_push(self.ring, status, *map(self.real, values))
-
-    def drain(self, size):
-        into = ctypes.create_string_buffer(size)
-        count = self.library.law_log_drain(self.ring, into, ctypes.c_uint32(size))
-        return into.raw[:count]
-
-    @property
-    def overruns(self):
-        return self.ring[2]
-
-    def file(self, path, rows):
-        path.write_bytes(self.header + rows)
-        return path
 
 
 def play(log, count, rng, burst):
