@@ -15,8 +15,10 @@ from __future__ import annotations
 import argparse
 import json
 import resource
+import signal
 import sys
 import time
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -145,14 +147,26 @@ def run_case(job: tuple[Actuator, int, float, int, float]) -> dict[str, Any]:
     try:
         return row | receiver.recv()
     except EOFError:
-        late = {"met": False, "status": f"not done in {limit_s:g} s", "cpu_s": limit_s, "process_s": limit_s}
-        return row | late | {"parameters": {}, "findings": [], "rounds": []}
+        process.join()
+        late = process.exitcode == -signal.SIGXCPU
+        return row | _say_failed(f"not done in {limit_s:g} s" if late else f"crashed: exit {process.exitcode}", limit_s)
     finally:
         process.join()
 
 
 def _send(sender: Any, *job: Any) -> None:
-    sender.send(fit_case(*job) | {"process_s": time.process_time()})
+    try:
+        row = fit_case(*job)
+    except Exception as error:  # a defect of the product or of this benchmark: the other cases go on
+        traceback.print_exc()
+        row = _say_failed(f"crashed: {type(error).__name__}", time.process_time())
+    sender.send(row | {"process_s": time.process_time()})
+
+
+def _say_failed(status: str, seconds: float) -> dict[str, Any]:
+    """Return the row of a case that has no fit."""
+    empty: dict[str, Any] = {"parameters": {}, "findings": [], "rounds": [], "silent": {}}
+    return empty | {"met": False, "status": status, "cpu_s": seconds, "process_s": seconds}
 
 
 def find_bad(row: dict[str, Any]) -> set[str]:

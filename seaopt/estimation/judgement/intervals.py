@@ -16,6 +16,7 @@ from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.model_error import ModelError
+from seaopt.estimation.solver.step_size import STEP_ERROR_PARAMETER, STEP_ERROR_SIGMA
 from seaopt.parameters import QUANTILE, Parameter
 from seaopt.plants.friction import list_smoothing
 from seaopt.simulation.simulate import input_samples
@@ -79,6 +80,20 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
             where=name,
             text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "
             "output, fix it, or give it a prior",
+        )
+
+
+def find_step_error(fit: Fit) -> Iterator[FitFinding]:
+    """Yield that the finest integration steps leave more error than they should, though too little to refuse a fit."""
+    output, moved = fit.step_error_sigma, fit.step_error_parameter
+    if fit.status == "converged" and (output > STEP_ERROR_SIGMA or moved > STEP_ERROR_PARAMETER):
+        yield FitFinding(
+            severity="warning",
+            kind="step",
+            where="",
+            text=f"the finest integration steps leave an error of {100.0 * output:.2g} % of a sensor's noise, which "
+            f"moves values by up to {moved:.2g} of their std; up to {100.0 * STEP_ERROR_SIGMA:.2g} % and "
+            f"{STEP_ERROR_PARAMETER:.2g} are meant to be left",
         )
 
 

@@ -23,13 +23,13 @@ from seaopt.estimation.judgement.candidates import free_delay
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.hypothesis_search import Search, search_hypotheses
-from seaopt.estimation.judgement.intervals import find_excesses, find_rough, find_single_event
+from seaopt.estimation.judgement.intervals import find_excesses, find_rough, find_single_event, find_step_error
 from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
 from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import count_evaluations
-from seaopt.estimation.result.findings import LET_STICK, FitFinding, OutputFit, find_energy, order_findings
+from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.widening import widen
@@ -141,6 +141,7 @@ def judge(
             named = [replace(each, severity="warning") if each.kind == "cause" else each for each in named]
         findings += named
         search = search if not causes or causes[0].refit is not None else search.yield_to_another()
+    findings += find_step_error(fit)  # at last, for no cause explains it
     return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))
 
 
@@ -438,6 +439,7 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
     yield replace(
         finding,
         preferred={name: value for cause in rivals for name, value in cause.preferred.items()},
-        proposal=LET_STICK if rivals[0].jumps else refit and refit.proposal,
+        proposal="[plant.NAME]\nsticks = true" if rivals[0].jumps else refit and refit.proposal,
         python="plant = so.plants.let_stick(plant)" if rivals[0].jumps else refit and refit.python,
+        sticks=rivals[0].jumps or None,
     )

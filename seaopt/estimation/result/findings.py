@@ -16,7 +16,6 @@ from seaopt.records import PlotAccessor, Worded, record
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-LET_STICK = "[plant.NAME]\nsticks = true"  # proposal of a cause: friction that is smoothed jumps at rest
 GUESS = "guess"  # kind of the finding that names unverified values
 
 
@@ -28,11 +27,12 @@ class FitFinding:
         *("severity", "kind", "where", "text", "preferred"),
         Key(field="proposal", name="proposal", omit_none=True),
         Key(field="python", name="python", omit_none=True),
+        Key(field="sticks", name="sticks", omit_none=True),
     )
 
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
     # for programs: "bound", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out", "noise",
-    # "range", "residual", "rough", "samples", "sharp", "starts"
+    # "range", "residual", "rough", "samples", "sharp", "starts", "step"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy
@@ -41,6 +41,7 @@ class FitFinding:
     # what adds a "cause" that a part brings, or lets friction jump: lines of a problem file for a plant NAME, and calls
     proposal: str | None = None
     python: str | None = None
+    sticks: bool | None = None  # whether a "cause" is friction that is smoothed where it jumps at rest
 
 
 @record

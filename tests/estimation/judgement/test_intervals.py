@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.estimation import Fit, compare_with_log
+from seaopt.estimation.judgement.intervals import find_step_error
 from seaopt.files import to_json
 
 N, PERIOD = 8000, 1e-3
@@ -137,6 +138,13 @@ def test_a_value_that_is_known_only_roughly_is_named(thor):
     assert rough.parameters["eta"].known == pytest.approx(1.96 * 0.3, rel=0.1) and not rough.met
     assert rough.parameters["J"].known < 0.2
     assert fine.met and fine.parameters["eta"].known == pytest.approx(1.96 * 0.03, rel=0.1)
+
+
+@pytest.mark.parametrize(("output", "moved", "warned"), [(0.009, 0.09, 0), (0.021, 0.09, 1), (0.009, 0.2, 1)])
+def test_a_step_error_above_a_hundredth_of_the_noise_is_said(output, moved, warned):
+    exact = fit(record_log(1.0, 0.0, 1))
+    findings = list(find_step_error(replace(exact, step_error_sigma=output, step_error_parameter=moved)))
+    assert [(each.severity, each.kind) for each in findings] == [("warning", "step")] * warned
 
 
 def test_one_step_has_no_power_to_refute():

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 from seaopt.estimation import Fit
-from seaopt.estimation.result.findings import LET_STICK, DerivedFigure, LogValues
+from seaopt.estimation.result.findings import DerivedFigure, LogValues
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.parameters import Parameter
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, list_notes
@@ -256,11 +256,11 @@ def _list_cures(fit: Fit) -> tuple[str, ...]:
     """Return the lines to write for the likely cause that is named first. What is not told from zero is not to be
     freed, nor how sharp friction is: a search for that takes long and ends nowhere.
     """
-    causes = (each for each in fit.findings if each.kind == "cause" and (each.preferred or each.proposal == LET_STICK))
+    causes = (each for each in fit.findings if each.kind == "cause" and (each.preferred or each.sticks))
     cause = next(causes, None)
     if cause is None:
         return ()
-    sticking = ["sticks = true in [plant.NAME]"] if cause.proposal == LET_STICK else []
+    sticking = ["sticks = true in [plant.NAME]"] if cause.sticks else []
     apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}
     return tuple(filter(None, [*sticking, *(spell_cure(name, value) for name, value in apart.items())]))
 
