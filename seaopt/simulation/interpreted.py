@@ -6,6 +6,7 @@ inherits from the one before is added to it (superposition), so that Python's lo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
@@ -219,8 +220,8 @@ def _correct(layout: Layout, z: Any, y: Any, w: Any, sensors: Any) -> Any:
 
 @memo
 def _program(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, int, int]) -> tuple[Any, Any]:
-    """Return CasADi's (Z, w, data) -> Z+, over FOLDED_SAMPLES, and (Z, w, data) -> [y, derivatives], of one sample. The
-    sizes are those of w, of the plant's part of the data, and of all data.
+    """Return CasADi's (Z, w, data) -> Z+ and (Z, w, data) -> [y, derivatives], of one sample. The sizes are those of w,
+    of the plant's part of the data, and of all data.
     """
     z, w = ca.MX.sym("z", model.nx, layout.states), ca.MX.sym("w", sizes[0])
     data = ca.MX.sym("data", sizes[2])
@@ -229,8 +230,13 @@ def _program(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, in
     after = _advance(model, scheme, layout, z, w, plant)
     if layout.corrected:
         after = after - _correct(layout, z, y, w[1 + scheme.inputs * model.nu :], data[sizes[1] :])
-    sample, output = ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
-    return sample.mapaccum(FOLDED_SAMPLES), output
+    return ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
+
+
+@memo
+def _chain(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, int, int], n: int) -> Any:
+    """Return the state's function of `_program` over n samples, one after the other."""
+    return _program(model, layout, scheme, sizes)[0].mapaccum(n)
 
 
 @memo
@@ -240,17 +246,22 @@ def _output_map(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int,
 
 
 def _fold(
-    function: Any, z: Float[np.ndarray, "nx nj"], w: Float[np.ndarray, "n w"], data: Float[np.ndarray, " m"]
+    chain: Callable[[int], Any],
+    z: Float[np.ndarray, "nx nj"],
+    w: Float[np.ndarray, "n w"],
+    data: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, "n1 nx nj"]:
-    """Fold a function of FOLDED_SAMPLES over all; the last chunk is filled up with repeats, which are dropped."""
+    """Fold over all samples at most FOLDED_SAMPLES at a time; the last ones are filled up to a power of two, so that
+    few functions do for all lengths, with repeats, which are dropped.
+    """
     n, (nx, nj) = len(w), z.shape
     path = np.empty((n + 1, nx, nj))
     path[0] = z
     for start in range(0, n, FOLDED_SAMPLES):
         part, count = w[start : start + FOLDED_SAMPLES], min(FOLDED_SAMPLES, n - start)
-        if count < FOLDED_SAMPLES:
-            part = np.vstack([part, np.repeat(part[-1:], FOLDED_SAMPLES - count, axis=0)])
-        block = np.array(function(path[start], part.T, data)).reshape(nx, FOLDED_SAMPLES, nj)
+        size = 1 << (count - 1).bit_length()
+        part = np.vstack([part, np.repeat(part[-1:], size - count, axis=0)])
+        block = np.array(chain(size)(path[start], part.T, data)).reshape(nx, size, nj)
         path[start + 1 : start + 1 + count] = block.transpose(1, 0, 2)[:count]
     return path
 
@@ -275,7 +286,7 @@ def _folded_trajectory(
     start = np.zeros((model.nx, layout.states))
     start[:, 0] = x0
     start[:, 1 + layout.shared : 1 + layout.shared + model.nx] = np.eye(model.nx)
-    path = _fold(_program(model, layout, scheme, sizes)[0], start, w, data)
+    path = _fold(lambda count: _chain(model, layout, scheme, sizes, count), start, w, data)
     flat = path[:-1].transpose(1, 0, 2).reshape(model.nx, n * layout.states)
     outputs = _output_map(model, layout, scheme, sizes, n)(flat, w.T, np.repeat(data[:, None], n, 1))
     y = np.array(outputs).reshape(model.ny, n, layout.states).transpose(1, 0, 2)

@@ -13,7 +13,18 @@ from scipy.signal import butter
 
 import seaopt as so
 from seaopt.errors import LogError, SimulationError
-from seaopt.simulation import Clock, Layout, Point, Segment, Weights, layout_of, make_model, run_passes, stream
+from seaopt.simulation import (
+    Clock,
+    Layout,
+    Point,
+    Segment,
+    Weights,
+    interpreted,
+    layout_of,
+    make_model,
+    run_passes,
+    stream,
+)
 from seaopt.simulation.compiled import Program
 from seaopt.simulation.interpreted import interpret_pass
 from seaopt.simulation.native import find_compiler
@@ -224,6 +235,18 @@ def test_compiled_and_interpreted_give_the_same_numbers(case, options, thor):
             scale = np.max(np.abs(b), axis=0, keepdims=True)
             np.testing.assert_allclose(a, b, atol=1e-10 * np.max(scale), rtol=1e-10, err_msg=name)
             np.testing.assert_allclose(a / (scale + 1e-300), b / (scale + 1e-300), atol=1e-9, err_msg=name)
+
+
+def test_without_a_compiler_a_short_run_takes_its_samples_and_no_others(thor, monkeypatch):
+    """Forty samples were run as four thousand; pieces, whose ends are filled up, are the run in one."""
+    model, segment, point, weights, x0 = passes("swing friction", thor, n=140)
+    sizes, chain = [], interpreted._chain
+    monkeypatch.setattr(interpreted, "_chain", lambda *given: sizes.append(given[-1]) or chain(*given))
+    whole = interpret_pass(model, segment, point, weights, 140, x0)
+    monkeypatch.setattr(interpreted, "FOLDED_SAMPLES", 100)
+    pieces = interpret_pass(model, segment, point, weights, 140, x0)
+    assert sizes == [256, 128, 64]
+    np.testing.assert_allclose(pieces.columns, whole.columns, rtol=1e-12, atol=1e-12 * np.max(np.abs(whole.columns)))
 
 
 @pytest.mark.parametrize("case", ["stand", "swing friction"])
