@@ -65,7 +65,7 @@ class CompiledLaw(LoadedLaw):
     def __init__(self, compiler, folder, controller, precision, **options):
         export(controller, folder, precision=precision, name="law", **options)
         gate = options.get("gate")
-        inputs = controller.law.d.size + (len(gate.reads) if gate else 0)
+        inputs = controller.law.d.size + (len({*gate.reads} - {*controller.signals}) if gate else 0)
         super().__init__(compiler, folder, "law", inputs, precision, gate is not None)
 
 

@@ -512,6 +512,8 @@ def force_mpc(
     require_type(params, (ParameterSet, Fit), "params", "give a ParameterSet or a Fit", ControlError)
     require_type(spec, MPCSpec, "spec", "give an MPCSpec", ControlError)
     check_guards(gate, heat, name_input(plant))
+    if gate is not None and gate.reads:
+        raise ControlError("gate.agreement: predictive control reads the force alone; leave it out")
     if spec.measured not in plant.outputs:
         raise ControlError(
             f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'

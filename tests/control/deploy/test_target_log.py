@@ -210,6 +210,7 @@ def test_a_schedule_logs_its_variable(precision, compiler, tmp_path):
     log = CompiledLog(compiler, tmp_path, schedule, 4, precision)
     channels = json.loads(log.header.removeprefix(b"SEALOG1"))["channels"]
     assert channels[-2] == [schedule.over, schedule.runnable().table.unit]
+    assert log.hash.decode() == hash_law(schedule.runnable())
 
 
 @pytest.mark.parametrize("rows", [0, 1, 3, 100, 1 << 21])

@@ -105,6 +105,20 @@ def test_what_disagrees_is_bridged_then_a_fault(name, check, compiler, tuned, tm
         assert statuses.index("fault") == 100 + gate.max_held
 
 
+def test_an_encoder_that_the_law_feeds_back_too_is_one_argument_in_c(check, compiler, tuned, tmp_path):
+    """A law of force and motor position: Python takes the encoder twice, as every law with terms does."""
+    law = replace(tuned.law, b=np.column_stack([tuned.law.b, tuned.law.b[:, 1]]), d=np.append(tuned.law.d, -50.0))
+    both = replace(tuned, law=law, design=None, reads=("F1", "q"), gate=make_gate(check))
+    compiled, law = CompiledLaw(compiler, tmp_path, both, "double", gate=both.gate), runnable(both)
+    rng, state = np.random.default_rng(6), law.reset()
+    for k in range(300):
+        force = 100.0 + SIGMA * rng.normal()
+        encoder = 100.0 / K + SIGMA_Q * rng.normal() + (k % 50 == 7) * 1e-3
+        wanted, state = law.step(state, 600.0, np.array([force, encoder]), [encoder])
+        assert compiled.step(600.0, force, encoder) == pytest.approx(wanted, rel=0, abs=1e-11)
+    assert state.status == "ok"
+
+
 def test_it_goes_into_the_file_and_comes_back(check, stand, thor, tuned):
     guarded = replace(tuned, gate=make_gate(check))
     assert so.Controller.from_dict(guarded.to_dict(), stand, thor).gate == guarded.gate
@@ -112,7 +126,7 @@ def test_it_goes_into_the_file_and_comes_back(check, stand, thor, tuned):
     assert "12.09 N and 2.6 % of what the spring carries by q are believed" in guarded.gate.describe("N")
 
 
-def test_what_cannot_be_compared_is_refused(stand, thor, tuned):
+def test_what_cannot_be_compared_is_refused(check, stand, thor, tuned):
     knee, noise = so.plants.rotary, dict.fromkeys(("F1", "F2", "q", "tau_s", "tau_d", "theta_m", "theta_l"), 1e-3)
     hard = knee(parts=("hardening",))
     sensed = knee(parts=("deflection_sensor",))
@@ -132,6 +146,8 @@ def test_what_cannot_be_compared_is_refused(stand, thor, tuned):
     mpc = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0))
     with pytest.raises(ControlError, match="it is of a law"):
         PlausibilityGate.of_controller(mpc, range_N=(-4000.0, 4000.0), agreement=True, noise=NOISE)
+    with pytest.raises(ControlError, match=r"gate.agreement: predictive control reads the force alone"):
+        force_mpc(stand, thor, MPCSpec(current_limit_A=9.0), gate=make_gate(check))
     law = runnable(tuned, gate=make_gate(Agreement(reads=("q",), weights=(K,), limit=12.0, share=0.0)))
     with pytest.raises(ControlError, match="the law reads q besides, and got 0; give one of each"):
         law.step(law.reset(), 0.0, 0.0)
