@@ -237,6 +237,17 @@ def run_mpc() -> dict[str, Any]:
     return {"commands": commands[::5], "law": mpc.law.responses(np.geomspace(0.1, 400.0, 12)).view(float)}
 
 
+def certify_mpc() -> dict[str, Any]:
+    """Return the certificate of predictive control that is read with noise, on two plants, and one that fails."""
+    mpc = force_mpc(STAND, THOR, MPCSpec(bandwidth_hz=25, current_limit_A=6.0, bounds={"F1": (-600.0, 600.0)}))
+    known = THOR.with_parameters(*(replace(THOR[name], prior_std=0.02 * THOR[name].value) for name in ("k", "b_r")))
+    plants, cell = {"stand": STAND, "swing": SWING}, so.Sensors(noise_std={"F1": 1.0}, quantisation={"F1": 0.5})
+    options: dict[str, Any] = {"samples": 40, "sensors": cell, "command_step": 1e-3}
+    fine = so.certify(mpc, plants, known, ranges={"I_p": (0.2, 0.6)}, runs=3, **options)
+    poor = so.certify(mpc, {"stand": STAND}, known, ranges={"k": (2e5, 4e5)}, runs=2, bound_tolerance=0.0, **options)
+    return {"fine": strip(fine.to_dict()), "poor": strip(poor.to_dict())}
+
+
 def draw_plants() -> dict[str, Any]:
     """Return drawn plants, by their seed."""
     plants = {"stand": STAND, "swing": SWING}
@@ -278,5 +289,5 @@ SUBJECTS: dict[str, Callable[[], Any]] = {
     **{f"problem_{name}": lambda name=name: run_problem(name) for name in ("thor", "knee", "pendulum")},
     **{f"problem_{name}": lambda name=name: run_problem(name) for name in ("torsion_actuator", "lever_knee")},
     **{f"law_{name}": lambda name=name: run_law(name) for name in LAWS},
-    "schedule": run_schedule, "mpc": run_mpc, "draws": draw_plants, "refusals": refuse,
+    "schedule": run_schedule, "mpc": run_mpc, "certificate_mpc": certify_mpc, "draws": draw_plants, "refusals": refuse,
 }  # fmt: skip
