@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
@@ -34,12 +34,14 @@ CURVE_BLOCK = 512  # draws whose curves are evaluated at once: bounds the cache
 BASE_ANGLES = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 60)])
 FAN = np.array([-3.0, -1.0, -0.4, 0.0, 0.4, 1.0, 3.0])  # about a pole, in distances of it from the circle
 MAXIMA = 3  # local maxima refined
+SAME_ANGLE = 1e-14
 SPEED_NEWTON_STEPS = 40
 
 NO_PEAKS = ((np.nan, np.nan), (np.nan, np.nan))
 Curves = Complex[np.ndarray, "n m"]  # a row per draw
 
 Peaks = tuple[Column, Column]
+Levels = Float[np.ndarray, "*n 2"]  # of Ms and Mt
 
 
 @record(eq=False)
@@ -62,6 +64,7 @@ def batch_figures(
     progress: Progress = ignore,
     threads: int = 2,
     peaks: bool = True,
+    by: Levels | None = None,
 ) -> BatchFigures:
     """Close `controller` around `plant` at every draw.
 
@@ -79,6 +82,8 @@ def batch_figures(
         Blocks of draws computed at once.
     peaks : bool
         Whether to compute Ms and Mt; if not, they are NaN where stable.
+    by : array, shape (n, 2), optional
+        Levels of Ms and Mt that draws are ranked by: a peak whose level is infinite is only that of its grid.
     """
     values, extra = expand_draws(plant, controller.delay(nominal), draws)
     count = values.shape[1]
@@ -86,10 +91,11 @@ def batch_figures(
     if count > 1 and np.array_equal(columns, np.repeat(columns[:, :1], count, axis=1)):
         # Nothing that is drawn concerns this plant: all draws are one loop.
         first = {name: column[:1] for name, column in draws.items()}
-        single = batch_figures(controller, plant, nominal, first, ignore, threads, peaks)
+        single = batch_figures(controller, plant, nominal, first, ignore, threads, peaks)  # of both curves
         progress(f"{count} of {count} draws", 1.0)
         return take_rows(single, np.zeros(count, dtype=int))
     parts: list[BatchFigures] = []
+    ranked = np.ones((count, 2)) if by is None else by
     with ThreadPoolExecutor(threads) as pool:
         for start in range(0, count, DRAW_BLOCK):
             block = slice(start, min(start + DRAW_BLOCK, count))
@@ -99,8 +105,8 @@ def batch_figures(
             pieces = [slice(k, k + CURVE_BLOCK) for k in range(0, delays.size, CURVE_BLOCK)]
             run = pool.map if len(pieces) > 1 else map  # a thread costs more than few draws take
             parts += run(
-                lambda piece, matrices=continuous, delay=delays: _close_piece(
-                    controller, tuple(matrix[piece] for matrix in matrices), delay[piece], peaks
+                lambda piece, matrices=continuous, delay=delays, ranked=ranked[block]: _close_piece(
+                    controller, tuple(matrix[piece] for matrix in matrices), delay[piece], peaks, ranked[piece]
                 ),
                 pieces,
             )
@@ -153,7 +159,7 @@ class Products:
 
 
 def _close_piece(
-    controller: Controller, continuous: LinearPlants, delay: Float[np.ndarray, " k"], peaks: bool
+    controller: Controller, continuous: LinearPlants, delay: Float[np.ndarray, " k"], peaks: bool, by: Levels
 ) -> BatchFigures:
     """Return the figures of some draws."""
     a, b, c, d = hold(*continuous, controller.sample_time_s, delay)
@@ -166,7 +172,7 @@ def _close_piece(
     ms, mt = np.full(radius.size, np.inf), np.full(radius.size, np.inf)
     stable = np.flatnonzero(radius < STABLE)
     if stable.size:
-        (ms[stable], _), (mt[stable], _) = find_peaks(take_rows(loops, stable)) if peaks else NO_PEAKS
+        (ms[stable], _), (mt[stable], _) = find_peaks(take_rows(loops, stable), by[stable]) if peaks else NO_PEAKS
     return BatchFigures(spectral_radius=radius, ms=ms, mt=mt)
 
 
@@ -188,58 +194,68 @@ def compute_products(
     )
 
 
-def find_peaks(loop: Products) -> tuple[Peaks, Peaks]:
-    """Return the largest abs(S) and abs(T) of every row, each with its angle."""
+def find_peaks(loop: Products, by: Levels) -> tuple[Peaks, Peaks]:
+    """Return the largest abs(S) and abs(T) of every row, each with its angle: the highest local maxima of its grid, by
+    Newton's method, of both curves and all rows in one batch. Where a curve's level is infinite, its grid has to do.
+    """
     angle, distance = np.abs(np.angle(loop.closed)), np.abs(1.0 - np.abs(loop.closed))
-    near_poles = (angle[:, :, None] + distance[:, :, None] * FAN).reshape(angle.shape[0], -1)
+    upper = np.imag(loop.closed)[:, :, None] >= 0.0  # of a pair; a point that is doubled looks like a maximum
+    near_poles = np.where(upper, angle[:, :, None] + distance[:, :, None] * FAN, 0.0).reshape(angle.shape[0], -1)
     base = np.broadcast_to(BASE_ANGLES, (angle.shape[0], BASE_ANGLES.size))
     theta = np.sort(np.clip(np.concatenate([base, near_poles], axis=1), 0.0, np.pi), axis=1)
     s = loop.sensitivity(np.exp(1j * theta))
-    return _find_highest(loop, theta, np.abs(s), False), _find_highest(loop, theta, np.abs(1.0 - s), True)
+    values = np.concatenate([np.abs(s), np.abs(1.0 - s)])
+    even = np.sin(theta) < SAME_ANGLE  # a curve at 0 and at half the rate: the grid has the value
+    counts = np.isfinite(by.T.reshape(-1, 1)) & ~np.concatenate([even, even])
+    rows, points = _list_maxima(values, counts)
+    at, count = rows % len(theta), len(theta)
+    low, high = _find_neighbours(theta[at], points)
+    refined, angles = _refine_peaks(take_rows(loop, at), low, theta[at, points], high, rows >= count)
+    every = np.arange(len(values))
+    first = np.argmax(values, axis=1)
+    top, where = values[every, first], theta[every % count, first]
+    rising = [k for k in np.argsort(refined) if refined[k] > top[rows[k]]]  # the last of a row is its highest
+    top[rows[rising]], where[rows[rising]] = refined[rising], angles[rising]
+    return (top[:count], where[:count]), (top[count:], where[count:])
 
 
-def _find_highest(
-    loop: Products, theta: Float[np.ndarray, "n m"], values: Float[np.ndarray, "n m"], complement: bool
-) -> Peaks:
-    """Return the largest value of each row and its angle: the highest local maxima of its grid, by Newton's method."""
-    rows = np.arange(theta.shape[0])
-    at = np.argmax(values, axis=1)
-    top, where = values[rows, at], theta[rows, at]
-    inner = values[:, 1:-1]
-    local = np.where((inner >= values[:, :-2]) & (inner >= values[:, 2:]), inner, -np.inf)
+def _list_maxima(
+    values: Float[np.ndarray, "n m"], counts: Bool[np.ndarray, "n m"]
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Return rows and columns of the highest local maxima, up to `MAXIMA` of a row, that count and come near
+    the largest.
+    """
+    every, top, inner = np.arange(len(values)), np.max(values, axis=1), values[:, 1:-1]
+    local = np.where(counts[:, 1:-1] & (inner >= values[:, :-2]) & (inner >= values[:, 2:]), inner, -np.inf)
+    rows, points = list[Int[np.ndarray, " k"]](), list[Int[np.ndarray, " k"]]()
     for _ in range(MAXIMA):
         at = np.argmax(local, axis=1)
-        worth = np.flatnonzero(local[rows, at] > 0.5 * top)
-        if not worth.size:
-            break
+        worth = np.flatnonzero(local[every, at] > 0.5 * top)
+        rows.append(worth)
+        points.append(at[worth] + 1)
         # Neighbours on a plateau, or at doubled points, are the same maximum.
         for near in (at - 1, at, at + 1):
-            local[rows, np.clip(near, 0, local.shape[1] - 1)] = -np.inf
-        point = at[worth] + 1
-        low, high = _find_neighbours(theta[worth], point)
-        peak, angle = _refine_peaks(take_rows(loop, worth), low, theta[worth, point], high, complement)
-        higher = peak > top[worth]
-        top[worth[higher]], where[worth[higher]] = peak[higher], angle[higher]
-    return top, where
+            local[every, np.clip(near, 0, local.shape[1] - 1)] = -np.inf
+    return np.concatenate(rows), np.concatenate(points)
 
 
 def _find_neighbours(theta: Float[np.ndarray, "n m"], point: Int[np.ndarray, " n"]) -> tuple[Column, Column]:
     """Return the neighbours of a grid point that do not coincide with it."""
     rows, last = np.arange(point.size), theta.shape[1] - 1
     centre = theta[rows, point]
-    low = np.max(np.where(theta < centre[:, None] - 1e-14, theta, 0.0), axis=1)
-    high = np.min(np.where(theta > centre[:, None] + 1e-14, theta, np.pi), axis=1)
+    low = np.max(np.where(theta < centre[:, None] - SAME_ANGLE, theta, 0.0), axis=1)
+    high = np.min(np.where(theta > centre[:, None] + SAME_ANGLE, theta, np.pi), axis=1)
     return low, np.where(point < last, high, centre)
 
 
-def _refine_peaks(loop: Products, low: Column, x: Column, high: Column, complement: bool) -> Peaks:
-    """Return the curve's value at its maximum between `low` and `high`, and the angle."""
+def _refine_peaks(loop: Products, low: Column, x: Column, high: Column, complement: Bool[np.ndarray, " n"]) -> Peaks:
+    """Return the value of each row's curve, T or S, at its maximum between `low` and `high`, and the angle."""
     best, where = np.zeros(x.size), x.copy()
     live = np.arange(x.size)
     low, x, high = low.copy(), x.copy(), high.copy()
     small = 1e-6 * (high - low)
     for _ in range(SPEED_NEWTON_STEPS):
-        value, g, slope = _differentiate(take_rows(loop, live), x[live], complement)
+        value, g, slope = _differentiate(take_rows(loop, live), x[live], complement[live])
         higher = value > best[live]
         best[live[higher]], where[live[higher]] = value[higher], x[live[higher]]
         low[live] = np.where(g > 0.0, x[live], low[live])
@@ -258,14 +274,14 @@ def _refine_peaks(loop: Products, low: Column, x: Column, high: Column, compleme
 
 
 @np.errstate(divide="ignore", invalid="ignore")  # on a pole of the open loop, an integrator at angle 0
-def _differentiate(loop: Products, x: Column, complement: bool) -> tuple[Column, Column, Column]:
+def _differentiate(loop: Products, x: Column, complement: Bool[np.ndarray, " n"]) -> tuple[Column, Column, Column]:
     """Return abs(curve) and the first two derivatives of log abs(curve)^2 along the angle."""
     z = np.exp(1j * x)[:, None]
     s, (first, second) = loop.sensitivity(z), loop.logarithmic(z)
-    value, curvature = s, second + first**2
-    if complement:
-        value = 1.0 - s
-        first, curvature = -s * first / value, -s * curvature / value
+    curvature, of_t = second + first**2, complement[:, None]
+    value = np.where(of_t, 1.0 - s, s)
+    share = np.where(of_t, -s / value, 1.0)
+    first, curvature = share * first, share * curvature
     rise = 2.0 * np.real(1j * z * first)[:, 0]
     bend = -2.0 * np.real(z * first + z**2 * (curvature - first**2))[:, 0]
     return np.abs(value)[:, 0], np.where(np.isfinite(rise), rise, 1.0), bend

@@ -23,15 +23,20 @@ from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAYS, differentiate_linearisation, find_delay, hold
 from seaopt.plants import Plant
 from seaopt.records import record
-from seaopt.robustness.uncertainty.batch import BatchFigures, Products, compute_products, expand_draws, find_peaks
+from seaopt.robustness.uncertainty.batch import (
+    BatchFigures,
+    Levels,
+    Products,
+    compute_products,
+    expand_draws,
+    find_peaks,
+)
 from seaopt.robustness.uncertainty.draws import Column, Points, Uncertainty
 from seaopt.robustness.uncertainty.rows import take_rows
 
 UNSTABLE = 1e6
 COMPLEX_STEP = 1e-20  # its square vanishes beside 1
 LARGEST_MS, LARGEST_MT = np.array([1.0, np.inf]), np.array([np.inf, 1.0])  # levels by which a severity is Ms, and Mt
-
-Levels = Float[np.ndarray, "*n 2"]
 
 SeveritySlopes = Points
 
@@ -135,7 +140,7 @@ def _radius_slopes(controller: Controller, loop: Products, sampled: _SampledPlan
 
 
 def _peak_slopes(controller: Controller, loop: Products, sampled: _SampledPlants, by: Levels) -> SeveritySlopes:
-    (ms, ms_at), (mt, mt_at) = find_peaks(loop)
+    (ms, ms_at), (mt, mt_at) = find_peaks(loop, by)
     ms_limit, mt_limit = by.T
     of_t = mt / mt_limit > ms / ms_limit
     z = np.exp(1j * np.where(of_t, mt_at, ms_at))

@@ -25,12 +25,12 @@ from seaopt.formatting import format_figure, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
-from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
+from seaopt.robustness.uncertainty.batch import BatchFigures, Levels, batch_figures
 from seaopt.robustness.uncertainty.draws import Column, Points, Uncertainty, confidence_radius
+from seaopt.robustness.uncertainty.rows import join_rows, take_rows
 from seaopt.robustness.uncertainty.severity import (
     LARGEST_MS,
     LARGEST_MT,
-    Levels,
     SeveritySlopes,
     limits,
     severities,
@@ -161,20 +161,26 @@ def find_worst(controller: Controller, plant: Plant, unknown: Uncertainty, drawn
     """
     if not unknown.size:
         return measure_worst(controller, plant, unknown.nominal, {})
-    start, levels = _choose_all_starts(controller, plant, unknown, drawn)
+    points = np.vstack([drawn, _list_corners(unknown)])
+    inner = _project(unknown, points)
+    moved = np.any(inner != points, axis=1)
+    figures = batch_figures(controller, plant, unknown.nominal, unknown.values(np.vstack([points, inner[moved]])))
+    at = np.where(moved, len(points) - 1 + np.cumsum(moved), np.arange(len(points)))  # whose figures those of inner are
+    start, levels, value = _choose_all_starts(controller, unknown, inner, take_rows(figures, at))
 
     def score(points: Points) -> Column:
         """Return severities, each by its start's level; points outside the bounds score minus infinity."""
-        figures = batch_figures(controller, plant, unknown.nominal, unknown.values(points))
         by = np.repeat(levels, len(points) // len(levels), axis=0)
+        figures = batch_figures(controller, plant, unknown.nominal, unknown.values(points), by=by)
         return np.where(unknown.inside(points), severities(controller, figures, by), -np.inf)
 
     def slopes(points: Starts) -> SeveritySlopes:
         return severity_slopes(controller, plant, unknown, points, levels)
 
-    points = np.vstack([drawn, _climb(unknown, start, score, slopes)])
-    values = unknown.values(points)
-    figures = batch_figures(controller, plant, unknown.nominal, values)
+    ends = _climb(unknown, start, value, score, slopes)
+    reached = batch_figures(controller, plant, unknown.nominal, unknown.values(ends))
+    figures = join_rows([take_rows(figures, np.arange(len(drawn))), reached])
+    values = unknown.values(np.vstack([drawn, ends]))
     rows = [int(np.argmax(severities(controller, figures, by))) for by in (LARGEST_MS, LARGEST_MT)]
     largest = [{name: float(column[row]) for name, column in values.items()} for row in dict.fromkeys(rows)]
     return combine_worst([measure_worst(controller, plant, unknown.nominal, at) for at in largest])
@@ -226,20 +232,23 @@ def _list_corners(unknown: Uncertainty) -> Points:
 
 
 def _choose_all_starts(
-    controller: Controller, plant: Plant, unknown: Uncertainty, drawn: Points
-) -> tuple[Starts, Levels]:
-    """Return where to start from for a large Ms, then for a large Mt, and the levels by which each is ranked."""
-    points = _project(unknown, np.vstack([drawn, _list_corners(unknown)]))
-    figures, inside = batch_figures(controller, plant, unknown.nominal, unknown.values(points)), unknown.inside(points)
-    starts, levels = list[Starts](), list[Levels]()
+    controller: Controller, unknown: Uncertainty, points: Points, figures: BatchFigures
+) -> tuple[Starts, Levels, Column]:
+    """Return where to start from for a large Ms, then for a large Mt, and the levels and severities by which each is
+    ranked.
+    """
+    inside = unknown.inside(points)
+    starts, levels, values = list[Starts](), list[Levels](), list[Column]()
     for by in (LARGEST_MS, LARGEST_MT):
         severity = np.where(inside, severities(controller, figures, by), -np.inf)
-        starts.append(_choose_starts(unknown, points, severity))
-        levels.append(np.tile(by, (len(starts[-1]), 1)))
-    return np.vstack(starts), np.vstack(levels)
+        kept = _choose_starts(unknown, points, severity)
+        starts.append(points[kept])
+        levels.append(np.tile(by, (len(kept), 1)))
+        values.append(severity[kept])
+    return np.vstack(starts), np.vstack(levels), np.concatenate(values)
 
 
-def _choose_starts(unknown: Uncertainty, points: Points, severity: Column) -> Starts:
+def _choose_starts(unknown: Uncertainty, points: Points, severity: Column) -> list[int]:
     """Return the worst points that are apart, then the worst others: not all starts may lie in one valley."""
     scaled = points.copy()
     scaled[:, : len(unknown.names)] /= max(confidence_radius(len(unknown.names)), 1.0)
@@ -250,12 +259,12 @@ def _choose_starts(unknown: Uncertainty, points: Points, severity: Column) -> St
         if apart and len(kept) < STARTS and np.isfinite(severity[i]):
             kept.append(i)
     kept += [i for i in order if i not in kept][: max(STARTS - len(kept), 0)]
-    return points[kept]
+    return kept
 
 
-def _climb(unknown: Uncertainty, x: Starts, score: Score, slopes: Slopes) -> Starts:
-    """Climb from every start until none rises further, and return the ends."""
-    value, rng = score(x), np.random.default_rng(0)
+def _climb(unknown: Uncertainty, x: Starts, value: Column, score: Score, slopes: Slopes) -> Starts:
+    """Climb from every start, whose severity is `value`, until none rises further, and return the ends."""
+    rng = np.random.default_rng(0)
     for _ in range(ROUNDS):
         slope = _project_slopes(unknown, x, slopes(x))
         trials = _propose_trials(unknown, x, slope, rng)
