@@ -17,7 +17,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.loops.sampled_plant import conditions, read_conditions
@@ -248,8 +248,8 @@ def _choose_all_starts(
     return np.vstack(starts), np.vstack(levels), np.concatenate(values)
 
 
-def _choose_starts(unknown: Uncertainty, points: Points, severity: Column) -> list[int]:
-    """Return the worst points that are apart, then the worst others: not all starts may lie in one valley."""
+def _choose_starts(unknown: Uncertainty, points: Points, severity: Column) -> Int[np.ndarray, " s"]:
+    """Return the numbers of the worst points that are apart, then the worst others: not all starts may lie in one valley."""
     scaled = points.copy()
     scaled[:, : len(unknown.names)] /= max(confidence_radius(len(unknown.names)), 1.0)
     order = list(np.argsort(severity)[::-1])
@@ -259,7 +259,7 @@ def _choose_starts(unknown: Uncertainty, points: Points, severity: Column) -> li
         if apart and len(kept) < STARTS and np.isfinite(severity[i]):
             kept.append(i)
     kept += [i for i in order if i not in kept][: max(STARTS - len(kept), 0)]
-    return kept
+    return np.array(kept)
 
 
 def _climb(unknown: Uncertainty, x: Starts, value: Column, score: Score, slopes: Slopes) -> Starts:
