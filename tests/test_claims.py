@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.robustness.certificate.simulated import STEPS
+from tests.checks import leave_out
 from tests.words import flatten
 
 LIMITS = {"max_sensitivity": 1.6, "max_complementary": 1.3, "max_reference_peak": 1.3, "max_noise_gain": 60}
@@ -102,7 +104,7 @@ class Scratch:
 @pytest.fixture(autouse=True)
 def without_steps(monkeypatch):
     """Let certificates have no simulated steps: what is looked at here is linear."""
-    monkeypatch.setattr(so.Certificate, "with_steps", lambda certificate, *_, **__: certificate)
+    leave_out(monkeypatch, STEPS)
 
 
 @pytest.mark.parametrize(

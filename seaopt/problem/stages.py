@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -41,7 +41,7 @@ from seaopt.control.laws.delay import (
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.mpc.stored import check_described
-from seaopt.control.scheduling.scheduled_controller import place_variable
+from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
 from seaopt.errors import ControlError, ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.estimation.result.findings import find_guesses, order_findings
@@ -262,16 +262,23 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
     return add_compensation(controller, **terms) if terms else controller
 
 
-def _add_impedance(problem: Problem, laws: Sequence[tuple[Controller, ParameterSet]]) -> list[Controller]:
+def _add_impedance(
+    problem: Problem,
+    laws: Sequence[tuple[Controller, ParameterSet]],
+    between: Iterable[tuple[Controller, ParameterSet]] = (),
+) -> list[Controller]:
     """Return controllers, each with the parameters of its place, with one outer loop; critical damping is the largest
-    that one of them needs.
+    that one of them needs, or of those `between` them.
     """
     outer = problem.table.impedance
     if outer is None:
         return [controller for controller, _ in laws]
     plant, filter_s = problem.plants[outer.plant], outer.velocity_filter_s
     if outer.damping == "critical":
-        each = [critical_impedance(law, plant, at, outer.stiffness, velocity_filter_s=filter_s) for law, at in laws]
+        each = [
+            critical_impedance(law, plant, at, outer.stiffness, velocity_filter_s=filter_s)
+            for law, at in (*laws, *between)
+        ]
         impedance = max(each, key=lambda one: one.damping)
     else:
         impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
@@ -315,8 +322,9 @@ def complete_schedule(
     link = (
         problem.plants[problem.table.impedance.plant] if problem.table.impedance is not None else problem.design_plant
     )
-    placed = [place_variable(link, values, schedule.over, point) for point in schedule.points]
-    laws = _add_impedance(problem, list(zip(schedule.controllers, placed, strict=True)))
+    place = partial(place_variable, link, values, schedule.over)
+    between = ((schedule.at(value), place(value)) for value in list_inner(schedule.points, PARTS))
+    laws = _add_impedance(problem, list(zip(schedule.controllers, map(place, schedule.points), strict=True)), between)
     guarded = [_guard(problem, controller, source) for controller in laws]
     gates = [controller.gate for controller in guarded if controller.gate is not None]
     widest = max(gates, key=lambda gate: gate.max_step_N, default=None)

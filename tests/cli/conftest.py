@@ -13,7 +13,8 @@ import pytest
 
 import seaopt as so
 from seaopt.cli import main
-from seaopt.robustness import Certificate
+from seaopt.robustness.certificate.simulated import SIMULATIONS
+from tests.checks import leave_out
 
 DEMO = so.demo_path().read_text(encoding="utf-8")
 SHORTER = {
@@ -101,7 +102,7 @@ def seaopt(folder, monkeypatch, capsys):
 @pytest.fixture
 def without_simulation(monkeypatch):
     """Let `certify` leave out the simulations: the finished run has them."""
-    monkeypatch.setattr(Certificate, "with_simulation", lambda certificate, **_: certificate)
+    leave_out(monkeypatch, SIMULATIONS)
 
 
 @pytest.fixture

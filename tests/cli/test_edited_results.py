@@ -13,6 +13,8 @@ from seaopt.cli.export import export_controller
 from seaopt.cli.session import SCHEMAS, Session
 from seaopt.files import read_json, seal, write_json
 from seaopt.robustness import Certificate
+from seaopt.robustness.certificate.simulated import SIMULATIONS
+from tests.checks import leave_out
 
 PROBLEM = """
 schema = 1
@@ -40,7 +42,7 @@ def certified(tmp_path_factory):
         folder = folders[name] = tmp_path_factory.mktemp(name)
         (folder / "problem.toml").write_text(text, encoding="utf-8")
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Certificate, "with_simulation", lambda certificate, **_: certificate)
+            leave_out(patch, SIMULATIONS)
             run(folder / "problem.toml", folder / "out", stages=("tune", "certify"))
     return folders
 

@@ -11,6 +11,8 @@ import pytest
 import seaopt as so
 from seaopt.cli import main
 from seaopt.problem import Stages, json_schema, tune_problem
+from seaopt.robustness.certificate.simulated import SIMULATIONS
+from tests.checks import leave_out
 
 DESIGN = """
 schema = 1
@@ -131,7 +133,7 @@ def test_seaopt_run_checks_them_and_its_exit_code_says_so(tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     options = ["--json"] if code == 0 else []
     monkeypatch.setattr(sys, "argv", ["seaopt", "run", "design.toml", *options])
-    monkeypatch.setattr(so.Certificate, "with_simulation", lambda certificate, **_: certificate)
+    leave_out(monkeypatch, SIMULATIONS)
     with pytest.raises(SystemExit) as end:
         main()
     out = capsys.readouterr().out

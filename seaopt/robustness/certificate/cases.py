@@ -1,21 +1,22 @@
 """The cases of a certificate, a law on its plants with each friction sliding and stuck, and what a check makes of them.
 
-A check measures the cases of a law, or of a schedule with its variable standing at one value, and gives evidence:
-requirements, fields of the certificate, and remarks. `certify` asks each that applies.
+A check measures the cases of a law, or of a schedule with its variable standing at one value, or what they say
+together, and gives evidence: requirements, fields of the certificate, and remarks. `certify` asks each that applies,
+one after the other: a check may read what those before it found.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import field
+from dataclasses import field, replace
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from seaopt.bench import Sensors
-from seaopt.control import Controller
+from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.laws.delay import Drive, find_drive, find_given_drive_delay, split_delayed
 from seaopt.control.loops.sampled_plant import DELAYS, DRIVE_DELAY
 from seaopt.errors import ControlError
@@ -27,7 +28,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import name_states, split_friction
 from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
-from seaopt.progress import Progress
+from seaopt.progress import Progress, divide
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.certificate.requirement import DESIGN_PLANT, MIN_FRICTION_MARGIN, Requirement, Spot
@@ -38,6 +39,7 @@ CONFIDENCE = 1.0 - 1e-6
 MOST_DELAY_SAMPLES = 20  # samples
 DESIGN_NAMES = ("design", DESIGN_PLANT)  # of the design plant where the caller does not list it
 Draw = Mapping[str, float]
+Subject = Controller | ScheduledController | ForceMPC
 
 
 @record
@@ -84,9 +86,10 @@ class Cases:
 
 @record(eq=False)
 class Survey:
-    """The cases of one law, and how they are to be measured."""
+    """The cases of one law, how they are to be measured, and what earlier checks found."""
 
-    shared: Shared[Cases]
+    subject: Subject
+    shared: Shared[Cases]  # of the subject's law, of predictive control in its linear region
     source: Source
     options: CertifyOptions
     drawing: np.random.Generator  # of the draws that are counted
@@ -98,6 +101,13 @@ class Survey:
     sensors: Sensors | None = None
     measured: Mapping[str, MeasuredResponse] = field(default_factory=dict[str, MeasuredResponse])
     executor: Executor | None = None
+    places: Mapping[float, Survey] = field(default_factory=dict[float, Any])  # of a schedule as a whole, by value
+    found: Mapping[str, Any] = field(default_factory=dict[str, Any])  # fields of the certificate, of earlier checks
+
+    @property
+    def devices(self) -> dict[str, Any]:
+        """What runs read with, and what their command is rounded to."""
+        return {"sensors": self.sensors, "command_step": self.options.command_step}
 
     @property
     def cases(self) -> Cases:
@@ -132,6 +142,23 @@ class Check:
     measure: Callable[[Survey, Progress], Evidence]
     seconds: Callable[[Survey], float] = lambda _: 0.0
     applies: Callable[[Survey], bool] = lambda survey: bool(survey.cases.models)
+
+
+def ask(checks: Sequence[Check], survey: Survey, progress: Progress) -> Evidence:
+    """Return what each of some checks that applies finds, with the fields that were found before."""
+    asked = [check for check in checks if check.applies(survey)]
+    rows, remarks = list[Requirement](), list[str]()
+    for check, part in zip(asked, divide(progress, *(check.seconds(survey) for check in asked)), strict=True):
+        evidence = check.measure(survey, part)
+        rows += (replace(row, place=row.place or survey.place) for row in evidence.requirements)
+        remarks += evidence.remarks
+        survey = replace(survey, found={**survey.found, **evidence.fields})
+    return Evidence(requirements=rows, fields=survey.found, remarks=tuple(remarks))
+
+
+def count_seconds(checks: Sequence[Check], survey: Survey) -> float:
+    """Return how long the checks that apply take as a rule."""
+    return sum(check.seconds(survey) for check in checks if check.applies(survey))
 
 
 def pose_cases(

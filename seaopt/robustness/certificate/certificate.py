@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,8 @@ from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.law import describe_integrators
-from seaopt.errors import ControlError, SeaoptError
+from seaopt.errors import ControlError
 from seaopt.estimation import warn_unidentified
-from seaopt.executors import Shared, map_ordered
 from seaopt.files import seal
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -33,21 +31,22 @@ from seaopt.robustness.certificate.compensation import describe_compensation, li
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import MarginDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
-from seaopt.robustness.certificate.requirement import LIMIT_CYCLE, Requirement, require_at_most
+from seaopt.robustness.certificate.requirement import Requirement
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
     Simulated,
-    require_runs,
+    list_worst_draws,
+    require_simulated,
     run_simulations,
+    select_simulated,
 )
 from seaopt.robustness.uncertainty.draws import Plants, Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.plant_margins import PlantMargins
 from seaopt.robustness.uncertainty.worst import Worst
-from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cycles, seek_limit_cycles
-from seaopt.robustness.verification.scenarios import step_scenarios
-from seaopt.robustness.verification.verification import Verification, verify
+from seaopt.robustness.verification.limit_cycles import FoundCycle
+from seaopt.robustness.verification.verification import Verification
 
 ROBUSTNESS_SCHEMA = "seaopt/robustness/3"
 UNINFORMATIVE_BOUND = 0.1  # failure probability above which no failure in the draws is noted to say little
@@ -156,11 +155,8 @@ class Certificate(Result, Worded):
 
     @property
     def simulated_models(self) -> Plants:
-        """The models that are simulated. Where a plant moves a schedule's variable, a law that is frozen there is not
-        what runs.
-        """
-        over = "" if self.place is None else self.place[0]
-        return {name: plant for name, plant in self.models.items() if over not in plant.states}
+        """The models that are simulated."""
+        return select_simulated(self.models, self.place)
 
     def with_simulation(
         self,
@@ -202,7 +198,7 @@ class Certificate(Result, Worded):
         """
         if not self.models:
             raise ControlError("nothing can be simulated without a model; design the controller on one")
-        simulations = run_simulations(
+        simulated = run_simulations(
             self.controller,
             self.simulated_models,
             self.parameters,
@@ -214,65 +210,10 @@ class Certificate(Result, Worded):
             executor=executor,
             progress=progress,
         )
-        runs = simulations.verification
-        rows = require_runs(simulations.left_out["simulation"] if runs is None else runs)
-        return replace(self, simulated=simulations, requirements=(*self._drop_runs(), *self._place_rows(rows)))
-
-    def with_steps(
-        self,
-        progress: Progress = ignore,
-        executor: Executor | None = None,
-        *,
-        sensors: Sensors | None = None,
-        command_step: float = 0.0,
-        seed: int = 1,
-    ) -> Certificate:
-        """Return the certificate with steps of several sizes simulated on every plant, at their worst draws too.
-
-        Where no link moves, a step must not overshoot by more than the reference peak allows, settle, and end at its
-        reference; nothing may oscillate. `certify` always does this, on ideal sensors; `with_simulation` plays all
-        other scenarios too.
-        """
-        try:
-            steps: Verification | str = verify(
-                self.controller,
-                self.simulated_models,
-                self.parameters,
-                scenarios=step_scenarios,
-                draws=self.list_draws(),
-                executor=executor,
-                progress=progress,
-                sensors=sensors,
-                command_step=command_step,
-                seed=seed,
-            )
-        except SeaoptError as error:
-            steps = str(error)
-        shown_of = {name: self.shows_friction_harmless(name) for name in self.simulated_models}
-        seek = partial(_seek_cycles, Shared((self.controller, self.models, self.parameters)))
-        cycles: dict[str, tuple[FoundCycle, ...]] = {}
-        for name, found in zip(shown_of, map_ordered(seek, shown_of.items(), executor), strict=True):
-            if found or not shown_of[name]:
-                ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
-                cycles[name] = (*found, *ends)
-        lasting = (  # those that steps end in are required of the steps
-            require_at_most(LIMIT_CYCLE, cycle.force_N, 0.0, plant=name, text=str(cycle))
-            for name, found in cycles.items()
-            for cycle in found
-            if cycle.predicted is not None and cycle.lasts
-        )
-        others = (row for row in self._drop_runs() if row.name != LIMIT_CYCLE)
-        rows = self._place_rows((*lasting, *require_runs(steps)))
-        return replace(self, steps=steps, cycles=cycles, requirements=(*others, *rows))
-
-    def _place_rows(self, rows: Iterable[Requirement]) -> Iterator[Requirement]:
-        """Yield rows with the value at which a schedule's variable stands."""
-        return (replace(row, place=self.place) for row in rows)
-
-    def _drop_runs(self) -> tuple[Requirement, ...]:
-        """Return what is required besides simulated runs, which are played again."""
-        played = (SIMULATION_FAILURES, *NAMED_FAULTS.values())
-        return tuple(row for row in self.requirements if row.name not in played)
+        played = (SIMULATION_FAILURES, *NAMED_FAULTS.values())  # which are played again
+        kept = (row for row in self.requirements if row.name not in played)
+        rows = (replace(row, place=self.place) for row in require_simulated(simulated))
+        return replace(self, simulated=simulated, requirements=(*kept, *rows))
 
     @property
     def draws(self) -> str:
@@ -292,15 +233,7 @@ class Certificate(Result, Worded):
 
     def list_draws(self) -> dict[str, list[ParameterSet]]:
         """Return the worst draws of each plant, of those with friction sliding and stuck, without what is nominal."""
-        varied = [each.name for each in self.varied]
-        return {
-            name: [
-                self.worst[state][1]
-                for state in split_friction({name: model}, self.parameters, varied)
-                if state in self.worst and self.worst[state].parameters
-            ]
-            for name, model in self.simulated_models.items()
-        }
+        return list_worst_draws(self.simulated_models, self.parameters, self.varied, self.worst)
 
     @classmethod
     def from_dict(
@@ -432,12 +365,3 @@ class Certificate(Result, Worded):
         if np.count_nonzero(steepest - flattest) > 1:
             return ("no simulated step ends in a limit cycle, and with several frictions none can be predicted",)
         return ("no limit cycle is predicted, and no simulated step ends in one",)
-
-
-def _seek_cycles(
-    loops: Shared[tuple[Controller, Plants, ParameterSet]], model: tuple[str, bool]
-) -> tuple[FoundCycle, ...]:
-    """Return the limit cycles of one model, whose friction is shown to be harmless or is not."""
-    controller, models, parameters = loops.value
-    name, shown = model
-    return seek_limit_cycles(controller, models[name], parameters, shown=shown)

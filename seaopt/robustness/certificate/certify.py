@@ -33,40 +33,35 @@ from seaopt.robustness.certificate.cases import (
     CONFIDENCE,
     Cases,
     CertifyOptions,
-    Check,
+    Subject,
     Survey,
+    ask,
+    count_seconds,
     digest_laws,
     pose_cases,
 )
 from seaopt.robustness.certificate.certificate import NO_MODEL, Certificate
 from seaopt.robustness.certificate.compensation import COMPENSATION
-from seaopt.robustness.certificate.constrained import (
-    RUN_SECONDS,
-    linear_controller,
-    require_constrained,
-    run_constrained,
-)
+from seaopt.robustness.certificate.constrained import CONSTRAINED, linear_controller
 from seaopt.robustness.certificate.friction import FRICTION
 from seaopt.robustness.certificate.impedance import IMPEDANCE
 from seaopt.robustness.certificate.limits import MEASURED, NOMINAL, measured_requirements
-from seaopt.robustness.certificate.measured_draws import DRAWS, draw_requirements, name_worst
-from seaopt.robustness.certificate.requirement import Requirement, Spot
+from seaopt.robustness.certificate.measured_draws import DRAWS
+from seaopt.robustness.certificate.requirement import Requirement
 from seaopt.robustness.certificate.scheduled import (
-    BOUND,
-    SWEEP,
+    JOINT_DRAWS,
+    STRETCHES,
+    SWEEPS,
     ScheduleCertificate,
-    measure_stretches,
-    measure_sweeps,
     pose_places,
 )
+from seaopt.robustness.certificate.simulated import SIMULATIONS, STEPS
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
-from seaopt.robustness.uncertainty.failure_probability import join_counts
-from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.verification import check_sensors
 
-CHECKS = (NOMINAL, DRAWS, FRICTION, IMPEDANCE, COMPENSATION, MEASURED)
+CHECKS = (NOMINAL, DRAWS, FRICTION, IMPEDANCE, COMPENSATION, MEASURED, STEPS, SIMULATIONS, CONSTRAINED)
+SCHEDULE_CHECKS = (STRETCHES, JOINT_DRAWS, SWEEPS)  # of a schedule as a whole, after those at each of its values
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
-STEPS, SIMULATIONS = 1.0, 3.5  # seconds that a plant takes as a rule
 
 
 class CertifyKeywords(TypedDict, total=False):
@@ -100,7 +95,7 @@ def certify(
     subject: Controller | ForceMPC, plants: Plants, parameters: Source, **options: Unpack[CertifyKeywords]
 ) -> Certificate: ...
 def certify(
-    subject: Controller | ForceMPC | ScheduledController,
+    subject: Subject,
     plants: Plants,
     parameters: Source,
     *,
@@ -244,16 +239,16 @@ def certify(
         _check_responses(plants, measured or {})
     else:
         check_sensors(sensors, law, {"design": law.design[0], **plants})
-    plans = isinstance(subject, ForceMPC)
     posing: dict[str, Any] = {
         "plants": plants, "parameters": parameters, "ranges": ranges or {}, "others": others or ParameterSet(),
         "bounds": bounds,
     }  # fmt: skip
     pose = partial(
         Survey,
+        subject=subject,
         source=parameters,
         options=options,
-        simulations=simulations and not plans,
+        simulations=simulations and not isinstance(subject, ForceMPC),
         sensors=sensors,
         measured=measured or {},
         executor=executor,
@@ -264,12 +259,7 @@ def certify(
         return _certify_schedule(subject, surveys, rows, progress)
     cases, rng = pose_cases(law, **posing), np.random.default_rng([seed, CERTIFICATE_STREAM, digest_laws(law)])
     survey = pose(shared=Shared(cases), drawing=rng, rng=rng, steps=bool(cases.models))
-    measuring, running = divide(progress, sum(_list_seconds(survey)), RUN_SECONDS * runs * len(cases.models) * plans)
-    certificate = _certify_cases(survey, measuring)
-    if isinstance(subject, ForceMPC):
-        constrained = run_constrained(survey, subject, running)
-        rows = require_constrained(constrained, max_failure_probability)
-        certificate = replace(certificate, constrained=constrained, requirements=(*certificate.requirements, *rows))
+    certificate = _certify_cases(survey, progress)
     draws = certificate.monte_carlo
     progress(f"{draws.samples} draws, {format_count(draws.failures, 'failure')}", 1.0)
     return certificate
@@ -300,43 +290,20 @@ def _check_responses(plants: Plants, measured: Mapping[str, MeasuredResponse]) -
         )
 
 
-def _list_checks(survey: Survey) -> list[Check]:
-    return [check for check in CHECKS if check.applies(survey)]
-
-
-def _list_seconds(survey: Survey) -> list[float]:
-    """Return how long each check that applies takes as a rule, and the simulations after them."""
-    models = len(survey.cases.models)
-    seconds = [check.seconds(survey) for check in _list_checks(survey)]
-    return [*seconds, STEPS * models * survey.steps, SIMULATIONS * models * (survey.steps and survey.simulations)]
-
-
 def _certify_cases(survey: Survey, progress: Progress) -> Certificate:
-    """Ask each check that applies to the cases of one law, and simulate it."""
-    cases, options = survey.cases, survey.options
-    *parts, stepping, simulating = divide(progress, *_list_seconds(survey))
-    evidence = [check.measure(survey, part) for check, part in zip(_list_checks(survey), parts, strict=True)]
-    fields: dict[str, Any] = {"plants": {}, "margins": {}}
-    for each in evidence:
-        fields |= each.fields
-    certificate = Certificate(
-        requirements=tuple(replace(row, place=survey.place) for each in evidence for row in each.requirements),
+    """Ask each check that applies to the cases of one law."""
+    cases, evidence = survey.cases, ask(CHECKS, survey, progress)
+    none: dict[str, Any] = {"plants": {}, "margins": {}, "steps": None if cases.models else NO_MODEL}
+    return Certificate(
+        requirements=tuple(evidence.requirements),
         controller=cases.controller,
         models=cases.models,
         parameters=cases.unknown.nominal,
         varied=cases.unknown.varied(),
-        steps=None if cases.models else NO_MODEL,
         place=survey.place,
-        remarks=tuple(remark for each in evidence for remark in each.remarks),
-        **fields,
+        remarks=evidence.remarks,
+        **none | dict(evidence.fields),
     )
-    devices: dict[str, Any] = {"sensors": survey.sensors, "command_step": options.command_step}
-    seeded: dict[str, Any] = {"seed": options.seed, "executor": survey.executor}
-    if survey.steps:
-        certificate = certificate.with_steps(**seeded, **({} if survey.simulations else devices), progress=stepping)
-    if survey.steps and survey.simulations:
-        certificate = certificate.with_simulation(**seeded, **devices, progress=simulating)
-    return certificate
 
 
 def _list_surveys(
@@ -388,31 +355,16 @@ def _certify_schedule(
 ) -> ScheduleCertificate:
     """Certify a schedule at each of its places, and between them."""
     *_, last = surveys.values()
-    seconds = [sum(_list_seconds(survey)) for survey in surveys.values()]
-    proof, motion = BOUND * len(surveys), SWEEP * last.simulations
-    models = len(last.cases.models)
-    *parts, proving, sweeping = divide(progress, *seconds, proof * models, motion * models)
-    places: list[Certificate] = []
-    worst: dict[Spot, Worst] = {}
-    for (value, survey), part in zip(surveys.items(), parts, strict=True):
-        place = _certify_cases(survey, prefix(part, f"{schedule.over} = {value:.4g}"))
-        worst |= name_worst(survey, place.worst)
-        places.append(place)
-    draws = join_counts([place.monte_carlo for place in places])
-    stretches = measure_stretches(schedule, surveys, proving)
-    sweeps = measure_sweeps(schedule, surveys, sweeping)
+    whole = replace(last, place=None, places=surveys)
+    seconds = [count_seconds(CHECKS, survey) for survey in surveys.values()]
+    *parts, joining = divide(progress, *seconds, count_seconds(SCHEDULE_CHECKS, whole))
+    places = tuple(
+        _certify_cases(survey, prefix(part, f"{schedule.over} = {value:.4g}"))
+        for (value, survey), part in zip(surveys.items(), parts, strict=True)
+    )
+    evidence = ask(SCHEDULE_CHECKS, replace(whole, found={"places": places}), joining)
     progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
+    of_places = (row for place in places for row in place.requirements)
     return ScheduleCertificate(
-        schedule=schedule,
-        places=tuple(places),
-        monte_carlo=draws,
-        requirements=(
-            *(row for place in places for row in place.requirements),
-            *of_responses,
-            *stretches.requirements,
-            *draw_requirements(draws, worst, last.options.max_failure_probability),
-            *sweeps.requirements,
-        ),
-        **stretches.fields,
-        **sweeps.fields,
+        schedule=schedule, requirements=(*of_places, *of_responses, *evidence.requirements), **evidence.fields
     )

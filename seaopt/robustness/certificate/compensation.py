@@ -52,12 +52,17 @@ EIGENVALUE_DRAWS = 20  # at most so many are looked at, of gravity and of ripple
 SLOPES = 9  # from the steepest negative to the steepest positive
 PLACES, INSIDE = 9, 0.95  # over so much of the range
 NEUTRAL = 1e-6  # beyond 1, of an eigenvalue that neither grows nor decays, by rounding and the series' last digits
+WITHOUT_TERMS = (
+    "margins, worst cases and draws are of the law without what it feeds back of gravity, ripple or speed; of the loop "
+    "with that, stability alone is shown"
+)
 FROM_REFERENCE = "friction is compensated from the reference, outside the loop: its stability is the law's without it"
 
 
 def measure_compensation(survey: Survey, _: Progress) -> Evidence:
     """Return whether the loop stays stable with what is compensated, on every plant and over draws."""
     cases, controller = survey.cases, survey.cases.controller
+    reads = () if controller.compensation is None else controller.compensation.reads
     margins = find_nominal_compensation(controller, cases.models, cases.unknown.nominal)
     shown = {name: partial(_find_margins, each.multiplier) for name, each in margins.items() if each.shown}
     draws = draw_margins(survey, shown)
@@ -68,6 +73,9 @@ def measure_compensation(survey: Survey, _: Progress) -> Evidence:
             *eigenvalue_requirements(controller, cases.models, gravity, ripple),
         ),
         fields={"compensation": margins, "compensation_draws": draws},
+        remarks=(WITHOUT_TERMS,)
+        if any(name in plant.outputs for plant in cases.models.values() for name in reads)
+        else (),
     )
 
 

@@ -51,7 +51,7 @@ from seaopt.plants import Plant
 from seaopt.plants.plant import deflection_row, output_function
 from seaopt.progress import Progress, count_off
 from seaopt.records import Result, record
-from seaopt.robustness.certificate.cases import Survey
+from seaopt.robustness.certificate.cases import Check, Evidence, Survey
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import place_values
@@ -396,8 +396,24 @@ class _Case:
         return worst, signal
 
 
-def run_constrained(survey: Survey, mpc: ForceMPC, progress: Progress) -> ConstrainedRuns:
-    """Draw and simulate runs with limits active, each on every plant; the survey's law is its linear region."""
+def measure_constrained(survey: Survey, progress: Progress) -> Evidence:
+    """Draw and simulate runs of predictive control with limits active, each on every plant."""
+    runs = run_constrained(survey, progress)
+    rows = require_constrained(runs, survey.options.max_failure_probability)
+    return Evidence(requirements=rows, fields={"constrained": runs})
+
+
+CONSTRAINED = Check(
+    measure=measure_constrained,
+    seconds=lambda survey: RUN_SECONDS * survey.options.runs * len(survey.cases.models),
+    applies=lambda survey: isinstance(survey.subject, ForceMPC),
+)
+
+
+def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
+    """Return what runs with limits active come to; the survey's law is the linear region of its subject."""
+    mpc = survey.subject
+    assert isinstance(mpc, ForceMPC)
     law, plants, unknown = survey.cases.controller, survey.cases.models, survey.cases.unknown
     runs, seed, sensors = survey.options.runs, survey.options.seed, survey.sensors or Sensors()
     tolerance, command_step = survey.options.bound_tolerance, survey.options.command_step

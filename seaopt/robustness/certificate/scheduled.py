@@ -39,11 +39,13 @@ from seaopt.progress import Progress, count_off
 from seaopt.records import Result, Worded, record
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
-from seaopt.robustness.certificate.cases import Cases, Evidence, Survey, pose_cases
+from seaopt.robustness.certificate.cases import Cases, Check, Evidence, Survey, pose_cases
 from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA, Certificate
-from seaopt.robustness.certificate.requirement import Requirement, require_at_least, require_at_most
+from seaopt.robustness.certificate.measured_draws import draw_requirements, name_worst
+from seaopt.robustness.certificate.requirement import Requirement, Spot, require_at_least, require_at_most
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
-from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
+from seaopt.robustness.uncertainty.failure_probability import MonteCarlo, join_counts
+from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.schedule_motion import Motion, describe_motion, move_schedule
 from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps, find_fastest, sweep_schedule
 from seaopt.units import unit_after
@@ -253,22 +255,31 @@ def pose_places(
     return places
 
 
-def measure_stretches(schedule: ScheduledController, surveys: Mapping[float, Survey], progress: Progress) -> Evidence:
+def measure_stretches(survey: Survey, progress: Progress) -> Evidence:
     """Bound Ms between neighbouring values, on every plant; what the tuner found there is what is required."""
-    pairs, (*_, last) = list(pairwise(surveys)), surveys.values()
-    shared = Shared((schedule, dict(last.cases.models)))
-    bounds = map_ordered(partial(_bound_plants, shared, last.cases.unknown.nominal), pairs, last.executor)
+    pairs, schedule, cases = list(pairwise(survey.places)), _take_schedule(survey), survey.cases
+    shared = Shared((schedule, dict(cases.models)))
+    bounds = map_ordered(partial(_bound_plants, shared, cases.unknown.nominal), pairs, survey.executor)
     stretches = tuple(bound for _ in count_off(pairs, "stretch", progress) for bound in next(bounds))
     return Evidence(requirements=_require_limits_between(schedule), fields={"stretches": stretches})
 
 
-def measure_sweeps(schedule: ScheduledController, surveys: Mapping[float, Survey], progress: Progress) -> Evidence:
+def measure_joint_draws(survey: Survey, _: Progress) -> Evidence:
+    """Count the draws of all values together, and require the worst of all."""
+    places: Sequence[Certificate] = survey.found["places"]
+    counts, worst = join_counts([place.monte_carlo for place in places]), dict[Spot, Worst]()
+    for at, place in zip(survey.places.values(), places, strict=True):
+        worst |= name_worst(at, place.worst)
+    rows = draw_requirements(counts, worst, survey.options.max_failure_probability)
+    return Evidence(requirements=rows, fields={"monte_carlo": counts})
+
+
+def measure_sweeps(survey: Survey, progress: Progress) -> Evidence:
     """Simulate sweeps of the variable on every plant, and plants that move it themselves."""
-    *_, last = surveys.values()
-    models, nominal, least = last.cases.models, last.cases.unknown.nominal, last.options.min_rate
-    sweeps: dict[str, tuple[Sweep, ...]] = {}
-    for name in count_off(list(models), "sweeps, plant", progress) if last.simulations else ():
-        of_plant = sweep_schedule(schedule, name, models[name], nominal, executor=last.executor)
+    schedule, models, nominal = _take_schedule(survey), survey.cases.models, survey.cases.unknown.nominal
+    least, sweeps = survey.options.min_rate, dict[str, tuple[Sweep, ...]]()
+    for name in count_off(list(models), "sweeps, plant", progress) if survey.simulations else ():
+        of_plant = sweep_schedule(schedule, name, models[name], nominal, executor=survey.executor)
         sweeps |= {name: of_plant} if of_plant else {}
     motions: dict[str, Motion] = {}
     if sweeps:
@@ -285,6 +296,18 @@ def measure_sweeps(schedule: ScheduledController, surveys: Mapping[float, Survey
         ),
         fields={"sweeps": sweeps, "motions": motions},
     )
+
+
+STRETCHES = Check(
+    measure=measure_stretches, seconds=lambda survey: BOUND * len(survey.places) * len(survey.cases.models)
+)
+JOINT_DRAWS = Check(measure=measure_joint_draws)
+SWEEPS = Check(measure=measure_sweeps, seconds=lambda survey: SWEEP * survey.simulations * len(survey.cases.models))
+
+
+def _take_schedule(survey: Survey) -> ScheduledController:
+    assert isinstance(survey.subject, ScheduledController)
+    return survey.subject
 
 
 def _rate_unit(schedule: ScheduledController) -> str:

@@ -1,4 +1,8 @@
-"""Run what the linear figures leave out, for a certificate: nonlinear plants, large signals, and the port."""
+"""Run what the linear figures leave out, for a certificate: nonlinear plants, large signals, and the port.
+
+Steps of several sizes are always simulated: where no link moves, a step must not overshoot by more than the reference
+peak allows, settle, and end at its reference; nothing may oscillate. All other scenarios are where they are asked for.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +19,27 @@ from seaopt.codec import to_content
 from seaopt.control import Controller
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
-from seaopt.executors import map_ordered
+from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import has_friction
+from seaopt.plants.friction import has_friction, split_friction
 from seaopt.progress import Progress, divide, ignore
 from seaopt.records import Result, Worded, record
-from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
+from seaopt.robustness.certificate.cases import Cases, Check, Evidence, Survey
+from seaopt.robustness.certificate.requirement import LIMIT_CYCLE, DrawnAt, Requirement, require_at_most
+from seaopt.robustness.uncertainty.draws import Plants, Varied
+from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.environments import StabilityMap, coupled_stability
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
+from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cycles, seek_limit_cycles
+from seaopt.robustness.verification.scenarios import step_scenarios
 from seaopt.robustness.verification.verification import Verification, check_plants, check_sensors, verify
 
 Played = TypeVar("Played")
 SIMULATION_FAILURES = "simulation_failures"
+STEP_SECONDS, SECONDS = 1.0, 3.5  # that steps, and all scenarios, of a plant take as a rule
 SWEEP, SCENARIOS, PORT = 1.5, 2.0, 0.7  # of the time of simulations: of each plant, and of the design plant's port
 STEP_OVERSHOOT, STEP_SETTLING = "step_overshoot", "step_settling_s"
 # Kinds of fault that have a figure of their own are requirements by these names; all others are counted.
@@ -82,6 +92,99 @@ class Simulated(Result, Worded):
         if self.passivity is None or self.environments is None:
             return None
         return self.passivity.to_dict() | {"environments": self.environments.to_dict()}
+
+
+def measure_steps(survey: Survey, progress: Progress) -> Evidence:
+    """Play steps of several sizes on every plant, at its worst draws too, and look for limit cycles."""
+    cases, unknown, found = survey.cases, survey.cases.unknown, survey.found
+    models = select_simulated(cases.models, survey.place)
+    devices = {} if survey.simulations else survey.devices  # else those scenarios, steps among them, have them
+    try:
+        steps: Verification | str = verify(
+            cases.controller,
+            models,
+            unknown.nominal,
+            scenarios=step_scenarios,
+            draws=list_worst_draws(models, unknown.nominal, unknown.varied(), found["worst"]),
+            executor=survey.executor,
+            progress=progress,
+            seed=survey.options.seed,
+            **devices,
+        )
+    except SeaoptError as error:
+        steps = str(error)
+    shown = {name: name not in found["friction"] or found["friction"][name].shown for name in models}
+    cycles: dict[str, tuple[FoundCycle, ...]] = {}
+    for name, seen in zip(
+        shown, map_ordered(partial(_seek, survey.shared), shown.items(), survey.executor), strict=True
+    ):
+        if seen or not shown[name]:
+            ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
+            cycles[name] = (*seen, *ends)
+    lasting = (  # those that steps end in are required of the steps
+        require_at_most(LIMIT_CYCLE, cycle.force_N, 0.0, plant=name, text=str(cycle))
+        for name, seen in cycles.items()
+        for cycle in seen
+        if cycle.predicted is not None and cycle.lasts
+    )
+    rows = () if survey.simulations else require_runs(steps)  # else those scenarios are judged
+    return Evidence(requirements=(*lasting, *rows), fields={"steps": steps, "cycles": cycles})
+
+
+def measure_simulations(survey: Survey, progress: Progress) -> Evidence:
+    """Play every scenario on the nonlinear plants, at their worst draws too."""
+    cases, unknown, steps = survey.cases, survey.cases.unknown, survey.found.get("steps")
+    models = select_simulated(cases.models, survey.place)
+    simulated = run_simulations(
+        cases.controller,
+        models,
+        unknown.nominal,
+        draws=list_worst_draws(models, unknown.nominal, unknown.varied(), survey.found["worst"]),
+        seed=survey.options.seed,
+        steps=steps if isinstance(steps, Verification) else None,
+        executor=survey.executor,
+        progress=progress,
+        **survey.devices,
+    )
+    return Evidence(requirements=require_simulated(simulated), fields={"simulated": simulated})
+
+
+STEPS = Check(
+    measure=measure_steps,
+    seconds=lambda survey: STEP_SECONDS * len(survey.cases.models),
+    applies=lambda survey: survey.steps,
+)
+SIMULATIONS = Check(
+    measure=measure_simulations,
+    seconds=lambda survey: SECONDS * len(survey.cases.models),
+    applies=lambda survey: survey.steps and survey.simulations,
+)
+
+
+def _seek(shared: Shared[Cases], model: tuple[str, bool]) -> tuple[FoundCycle, ...]:
+    """Return the limit cycles of one model, whose friction is shown to be harmless or is not."""
+    cases, (name, shown) = shared.value, model
+    return seek_limit_cycles(cases.controller, cases.models[name], cases.unknown.nominal, shown=shown)
+
+
+def select_simulated(models: Plants, place: tuple[str, float] | None) -> dict[str, Plant]:
+    """Return the models that are simulated. Where a plant moves a schedule's variable, a law that is frozen there is
+    not what runs.
+    """
+    over = "" if place is None else place[0]
+    return {name: plant for name, plant in models.items() if over not in plant.states}
+
+
+def list_worst_draws(
+    models: Plants, nominal: ParameterSet, varied: Sequence[Varied], worst: Mapping[str, Worst]
+) -> dict[str, list[ParameterSet]]:
+    """Return the worst draws of each plant, of those with friction sliding and stuck, without what is nominal."""
+    names = [each.name for each in varied]
+    states = {name: split_friction({name: model}, nominal, names) for name, model in models.items()}
+    return {
+        name: [worst[state][1] for state in of_model if state in worst and worst[state].parameters]
+        for name, of_model in states.items()
+    }
 
 
 def run_simulations(
@@ -166,6 +269,12 @@ def _attempt(verb: Callable[[], Played]) -> tuple[Played | None, str]:
         return None, str(error)
     except np.linalg.LinAlgError as error:
         return None, f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
+
+
+def require_simulated(simulated: Simulated) -> list[Requirement]:
+    """Return what the scenarios require, or why there are none."""
+    runs = simulated.verification
+    return require_runs(simulated.left_out["simulation"] if runs is None else runs)
 
 
 def require_runs(runs: Verification | str) -> list[Requirement]:

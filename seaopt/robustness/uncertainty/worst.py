@@ -233,7 +233,7 @@ def _list_corners(unknown: Uncertainty) -> Points:
 
 def _choose_all_starts(
     controller: Controller, unknown: Uncertainty, points: Points, figures: BatchFigures
-) -> tuple[Starts, Levels, Column]:
+) -> tuple[Starts, Levels, Float[np.ndarray, " s"]]:
     """Return where to start from for a large Ms, then for a large Mt, and the levels and severities by which each is
     ranked.
     """
@@ -249,7 +249,7 @@ def _choose_all_starts(
 
 
 def _choose_starts(unknown: Uncertainty, points: Points, severity: Column) -> Int[np.ndarray, " s"]:
-    """Return the numbers of the worst points that are apart, then the worst others: not all starts may lie in one valley."""
+    """Return numbers of the worst points that are apart, then of the worst others: not all may lie in one valley."""
     scaled = points.copy()
     scaled[:, : len(unknown.names)] /= max(confidence_radius(len(unknown.names)), 1.0)
     order = list(np.argsort(severity)[::-1])

@@ -11,7 +11,9 @@ import pytest
 import seaopt as so
 from seaopt.control import Law, assess, command_of, drive_pid, ideal_pid, parallel_pid, read_law
 from seaopt.errors import ControlError, FileError
+from seaopt.robustness.certificate.simulated import STEPS
 from tests.c_code import CompiledLaw
+from tests.checks import leave_out
 from tests.laws import law_of
 
 TS = 1e-3
@@ -141,7 +143,7 @@ def test_more_bandwidth_than_asked_is_enough(stand, thor):
 
 def test_a_law_beyond_the_structures_is_certified_and_exported(stand, swing, thor, compiler, tmp_path, monkeypatch):
     """A pid through two lags, a notch and a lead: no structure of the tuner's has its like."""
-    monkeypatch.setattr(so.Certificate, "with_steps", lambda certificate, *_, **__: certificate)
+    leave_out(monkeypatch, STEPS)
     pid = parallel_pid(k_p=1.2, k_i=30.0, k_d=0.012, T_f=2e-3, sample_time_s=TS, feedforward=1.0).to_control()
     shape = control.tf([0.6, -0.2], [1.0, -0.6], TS) * control.tf([1.0, -1.2, 0.75], [1.0, -0.9, 0.45], TS)
     law = Law.from_control(control.ss(shape) * pid)

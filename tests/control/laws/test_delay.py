@@ -27,11 +27,13 @@ from seaopt.problem import read_problem
 from seaopt.problem.stages import assess_problem, list_plants
 from seaopt.robustness import batch_figures, bracket, combine_uncertainty
 from seaopt.robustness.certificate.cases import find_own_drive
+from seaopt.robustness.certificate.simulated import STEPS
 from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
 from seaopt.robustness.verification.environments import attach_environment
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario
+from tests.checks import leave_out
 from tests.words import flatten
 
 DELAY_S = 2.04e-3
@@ -42,7 +44,7 @@ SPEC = so.ControllerSpec(bandwidth_hz=25, max_sensitivity=1.6, max_noise_gain=25
 @pytest.fixture(autouse=True)
 def without_steps(monkeypatch):
     """Let certificates have no simulated steps: what is looked at here is linear."""
-    monkeypatch.setattr(so.Certificate, "with_steps", lambda certificate, *_, **__: certificate)
+    leave_out(monkeypatch, STEPS)
 
 
 @pytest.fixture(scope="module")

@@ -25,8 +25,10 @@ from seaopt.control.running.outer_run import enclose_law
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.reporting.sections.kinds.controller import list_achieved
+from seaopt.robustness.certificate.simulated import STEPS
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, step_scenarios
+from tests.checks import leave_out
 
 STAND, SWING = so.plants.rotary(link="locked"), so.plants.rotary(link="pendulum")
 VALUES = SWING.defaults.update(
@@ -188,7 +190,7 @@ def test_what_it_cannot_do_is_said(changed: dict[str, object], said: str) -> Non
 
 
 def test_it_is_certified_sliding_and_stuck(tuned: Controller, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(so.Certificate, "with_steps", lambda certificate, *_, **__: certificate)
+    leave_out(monkeypatch, STEPS)
     certificate = so.certify(tuned, {"swing": SWING}, VALUES, samples=20, simulations=False)
     assert {"swing sliding", "swing stuck"} < set(certificate.plants) and len(certificate.plants) == 4
     assert all(one.stable for one in certificate.plants.values())

@@ -21,7 +21,9 @@ from seaopt.robustness import batch_figures, failure_bound
 from seaopt.robustness.certificate.cases import digest_laws
 from seaopt.robustness.certificate.certify import CertifyKeywords
 from seaopt.robustness.certificate.friction import friction_requirements
+from seaopt.robustness.certificate.simulated import STEPS
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges
+from tests.checks import leave_out
 from tests.laws import scaled
 from tests.words import flatten
 
@@ -495,7 +497,7 @@ def test_the_tuner_keeps_the_limits_sliding_and_stuck(stand, thor):
 def test_a_friction_margin_below_the_curves_own_slope_is_required_over_draws_too(stand, rubbing, monkeypatch):
     """Of nearly Coulomb's jump nothing is shown, a flatter curve is; at draws as at the nominal parameters."""
     # Simulated steps have no part in a margin, and take a minute on friction this sharp.
-    monkeypatch.setattr(so.Certificate, "with_steps", lambda certificate, *_, **__: certificate)
+    leave_out(monkeypatch, STEPS)
     spec = so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, compute_delay_samples=2)
     controller, sharp = so.tune(stand, rubbing, spec), rubbing.update(v_s=1e-6)
     asked = {"ranges": {"eta": (0.4, 3.0)}, "samples": 3}

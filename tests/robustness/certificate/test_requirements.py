@@ -14,7 +14,9 @@ from seaopt.cli import main
 from seaopt.control import assess, ideal_pid
 from seaopt.errors import FileError
 from seaopt.files import seal, to_json
+from seaopt.robustness.certificate.simulated import SIMULATIONS, STEPS
 from seaopt.robustness.certificate.stored import read_requirements
+from tests.checks import leave_out
 from tests.words import flatten
 
 BAND = (1.0, 60.0)
@@ -36,7 +38,7 @@ def cosine_by_hand(controller, params, f):
 @pytest.fixture(autouse=True)
 def without_steps(monkeypatch):
     """Let certificates have no simulated steps: what is looked at here is linear."""
-    monkeypatch.setattr(so.Certificate, "with_steps", lambda certificate, *_, **__: certificate)
+    leave_out(monkeypatch, STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +134,7 @@ def test_the_command_exits_1(loud, tmp_path, monkeypatch, capsys):
     (tmp_path / "loud.json").write_text(to_json(loud.to_dict()), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["seaopt", "certify", "problem.toml", "-o", "out", "--controller", "loud.json"])
-    monkeypatch.setattr(so.Certificate, "with_simulation", lambda certificate, **_: certificate)
+    leave_out(monkeypatch, SIMULATIONS)
     with pytest.raises(SystemExit) as end:
         main()
     out = capsys.readouterr()
