@@ -9,8 +9,8 @@ every frequency from `from_hz` to `until_hz`,
 which is affine in the gains between the absolute values. Scan, quadratic programs and interior point need no more than
 X and m, and the certificate no more than the figure.
 
-A new limit is one row here, and a field of the same name where it is typed: in `laws.spec.ControllerSpec` and
-`problem.schema.ControllerTable`, which take default, range and description from the row.
+A new limit is one row here, and a field of the same name in `laws.spec.ControllerSpec`, which takes default, range and
+description from the row; problem files have it from there.
 """
 
 from __future__ import annotations

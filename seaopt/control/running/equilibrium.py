@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.realisation import Reading, RunnableLaw
+from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.running.loop_kernel import observe_function
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
@@ -59,19 +60,18 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
     figures = np.zeros((len(params), 4))
     z = np.zeros((len(params), loop.law_states + loop.waiting))
     for run, ((x, u), values) in enumerate(zip(rows, params, strict=True)):
-        ripple = None if law.compensation is None else law.compensation.ripple
-        if not (np.any(x) or np.any(u)) and ripple is None:
+        if not (np.any(x) or np.any(u)) and law.compensation is None:
             continue
         y = np.array(observe(0.0, x, u, values.vector)).ravel()
         read = y[[names.index(name) for name in loop.fed_back]]
-        force = float(read[0])
-        added = 0.0 if ripple is None else law.per_effort * ripple.effort(float(y[names.index(ripple.reads)]))
+        force, weight, added = float(read[0]), 0.0, 0.0
+        if law.compensation is not None:
+            further = [float(y[names.index(name)]) if name in names else 0.0 for name in law.compensation.reads]
+            weight, added, _ = law.compensation.step(FORGOTTEN, 0.0, further)
         inner, reference = _law_at_rest(
-            law, read if law.measured > 1 else force, float(u[0]) - added, plant, loop.regulated
+            law, read if law.measured > 1 else force, float(u[0]) - law.per_effort * added, plant, loop.regulated
         )
-        if law.compensation is not None and law.compensation.gravity is not None:
-            gravity = law.compensation.gravity
-            reference -= gravity.effort(float(y[names.index(gravity.reads)])) if gravity.reads in names else 0.0
+        reference -= weight
         forgotten = np.zeros(loop.law_states - inner.size - 1)
         z[run] = np.concatenate([inner, forgotten, np.full(1 + loop.waiting, u[0])])
         figures[run] = reference, force, u[0], 0.0 if plant.energy is None else y[-1]
