@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 import seaopt as so
+from seaopt.problem import stages
+from tests.schedules import read_knee, tune_knee
 from tests.words import check_words
 
 KNEE = Path(__file__).resolve().parents[2] / "problems" / "knee.toml"
@@ -51,6 +53,33 @@ def test_the_knee_runs_with_everything_met(tmp_path):
     for name, value in TRUTH.items():
         fitted = stored["fit"]["parameters"][name]
         assert abs(fitted["value"] - value) < 4 * fitted["std"]
+
+
+def test_critical_damping_is_the_largest_between_the_points_too(monkeypatch):
+    """A value of the variable stands for the damping that it needs."""
+    values = read_knee()[-1]
+    problem, schedule = so.read_problem(KNEE), tune_knee()
+
+    def need(law, plant, at, stiffness, **_):
+        return so.control.Impedance(stiffness=stiffness, damping=at["phi"].value)
+
+    monkeypatch.setattr(stages, "critical_impedance", need)
+
+    def note(law, plant, at, impedance, *, name):
+        noted.append(impedance.damping)
+        return law
+
+    noted = []
+    monkeypatch.setattr(stages, "add_impedance", note)
+    points, between = (
+        [
+            (schedule.controllers[0], values.with_parameters(so.Parameter(name="phi", value=value, unit="rad")))
+            for value in each
+        ]
+        for each in ((1.0, 2.0), (2.5, 1.5))
+    )
+    stages._add_impedance(problem, points, iter(between))
+    assert noted == [2.5, 2.5]
 
 
 SCREW = '[plant.screw]\nkind = "high_impedance"\n[plant.swing]'

@@ -175,7 +175,13 @@ def test_friction_is_looked_at_on_a_plant_that_moves_the_variable_and_over_draws
     cases = pose_places(schedule, {"stand": read_knee()[0], "swing": swing}, values, ranges, so.ParameterSet())[0.2]
     rng = np.random.default_rng(2)
     survey = Survey(
-        shared=Shared(cases), source=values, options=CertifyOptions(samples=4), drawing=rng, rng=rng, place=("phi", 0.2)
+        subject=schedule,
+        shared=Shared(cases),
+        source=values,
+        options=CertifyOptions(samples=4),
+        drawing=rng,
+        rng=rng,
+        place=("phi", 0.2),
     )
     found = FRICTION.measure(survey, ignore)
     (row,) = found.requirements
