@@ -106,7 +106,7 @@ class Subject:
             "friction doubled": ("law", harder, None, friction),
             "spring 20 % softer": ("law", lower, None, (("parameter", names["stiffness"]),)),
             "sign": ("law", replace(machine, reading_sign=-1.0), None, (("sign", signal),)),
-            "saturated sensor": ("law", replace(machine, sensor_range=0.8 * peak[signal]), None, (("range", signal),)),
+            "saturated sensor": ("law", replace(machine, sensor_range=0.6 * peak[signal]), None, (("range", signal),)),
             "missing feedforward": ("bare", machine, None, (("feedforward", "reference"),)),
             "another controller": ("slower", machine, None, (("another law", OLD),)),
         }

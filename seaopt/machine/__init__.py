@@ -5,7 +5,7 @@ from seaopt.machine.bringup import Band, BringUp, Stage, bring_up
 from seaopt.machine.bringup_files import write_bring_up
 from seaopt.machine.differences import Difference, Differences
 from seaopt.machine.replay import Cause, Replay
-from seaopt.machine.response import Judged, Response
+from seaopt.machine.response.verdicts import Judged, Response
 
 __all__ = [
     "Acceptance", "Band", "BringUp", "Cause", "Difference", "Differences", "Judged", "Replay", "Response", "Stage",

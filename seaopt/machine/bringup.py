@@ -15,7 +15,7 @@ from seaopt.errors import ControlError, SeaoptError, require_number, require_typ
 from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
 from seaopt.machine.excitation import Excitation, design_excitation
-from seaopt.machine.response import LEAST_PHASES, has_dry_friction
+from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore

@@ -28,8 +28,8 @@ from jaxtyping import Complex, Float
 from seaopt.control import Controller, SampledLoop, run_loop, runnable
 from seaopt.control.loops.sampled_plant import DELAYS, find_delay, read_conditions
 from seaopt.logs.quality.faults import find_runs
-from seaopt.machine.periods import cut_periods, join_blocks, shorten
-from seaopt.machine.response import Measured, has_dry_friction
+from seaopt.machine.response.periods import cut_periods, join_blocks, shorten
+from seaopt.machine.response.verdicts import Measured, has_dry_friction
 from seaopt.machine.ticks import Ticks
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.machine.acceptance import Acceptance
-from seaopt.machine.response import GRACE, Measured
+from seaopt.machine.response.verdicts import GRACE, Measured
 from seaopt.reporting.figures.panel import BLUE, LIMIT, VERMILION, Panel, draw_level, frequency_panel, to_decibel
 
 

@@ -11,7 +11,7 @@ from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.differences import Difference, Differences
 from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Cause, Replay
-from seaopt.machine.response import CLOSEST, FEWEST_LINES, Judged, Measured, Response
+from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, Judged, Measured, Response
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -166,18 +166,19 @@ def _describe_response(response: Response, left_out: Mapping[str, str]) -> Secti
     rows = tuple(
         (
             row.name,
-            Mark(text=row.outcome, style=OUTCOMES[row.outcome]),
+            "" if row.limit is None else Mark(text=row.outcome, style=OUTCOMES[row.outcome]),
             ""
             if row.limit is None or row.name == "stability"
             else f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}",
-            "" if row.name == "stability" else format_number(row.value, 3),
+            "" if row.name == "stability" else f"{format_number(row.value, 3)}{unit_after(row.unit)}",
             "" if row.name == "stability" else _show_interval(row),
+            format_number(row.predicted, 3, ""),
             format_number(row.where_hz, 3),
             "" if row.periods is None else str(row.periods),
         )
         for row in response.judged
     )
-    head = ("figure", "verdict", "limit", "measured", "interval", "at (Hz)", "periods needed")
+    head = ("figure", "verdict", "limit", "measured", "interval", "predicted", "at (Hz)", "periods needed")
     aside = ", ".join(_say_extent(part) for part in response.measured)
     remarks = [
         f"Each statement holds with a probability of {100.0 * response.confidence:g} %. Limits are those of the "
@@ -189,7 +190,7 @@ def _describe_response(response: Response, left_out: Mapping[str, str]) -> Secti
     if response.needs_lines is not None:
         remarks.append(f"Nothing is confirmed{_say_lines(response)}.")
     remarks += [f"Left out: {text}" for text in left_out.values()]
-    tables = (Table(head=head, rows=rows, align="<<>>>>>"),)
+    tables = (Table(head=head, rows=rows, align="<<>>>>>>", optional=("periods needed",)),)
     return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks))
 
 
@@ -242,6 +243,10 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     late = sorted({row.command_late for row in result.replays if row.met and row.command_late})
     remarks = tuple(
         f"The command is logged {abs(by)} row {'late' if by > 0 else 'early'}, which is allowed." for by in late
+    )
+    rows_of = sorted({row.ticks_per_row for row in result.replays if row.ticks_per_row > 1})
+    remarks += tuple(
+        f"A log has one row for {each} ticks: it is compared at the lines of the reference." for each in rows_of
     )
     sections = [
         Section(

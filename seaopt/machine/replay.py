@@ -27,8 +27,9 @@ from jaxtyping import Bool, Float
 from seaopt.control import Controller, ForceMPC, RunnableLaw, RunnableSchedule, runnable
 from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.control.loops.compensation.terms import FORGOTTEN
-from seaopt.errors import SeaoptError
+from seaopt.errors import LogError, SeaoptError
 from seaopt.logs.quality.faults import find_quantisation
+from seaopt.machine.decimated import count_ticks_per_row, match_lines
 from seaopt.machine.stepped import Setting, Source, State, limit_law, list_starts, make_setting, run_setting
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
@@ -87,6 +88,7 @@ class Replay:
     command_late: int  # rows by which the command is logged later than what it was made of
     rate_hz: float  # of the log
     law_rate_hz: float
+    ticks_per_row: int = 1  # of a log that has every n-th tick: it was compared line by line
     causes: tuple[Cause, ...] = ()
 
 
@@ -126,6 +128,10 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
     """
     whole = make_setting(source, ticks)
     match = play(whole)
+    ticks_per_row = 1 if match.met else count_ticks_per_row(whole.controller, ticks)
+    by_line = _replay_lines(whole, ticks_per_row) if ticks_per_row > 1 else None
+    if by_line is not None:
+        return by_line
     late, causes = 0, ()
     if not match.met:
         causes, changed = find_causes(whole, match, others or {})
@@ -146,12 +152,51 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
         allowed=math.sqrt(float(np.mean(match.allowed**2))),
         rms=float(np.std(ticks.command)),
         off_from=None if match.met or not off.size else int(off[0]),
-        saturated=float(np.mean(np.abs(ticks.command) >= AT_LIMIT * limit)) if math.isfinite(limit) else 0.0,
+        saturated=find_saturated(ticks, limit),
         command_late=late,
         rate_hz=rate_hz,
         law_rate_hz=law_rate_hz,
         causes=causes,
     )
+
+
+def _replay_lines(setting: Setting, ticks_per_row: int) -> Replay | None:
+    """Return the replay of a log with every n-th tick, where its lines are those of the law, or of a factor times it;
+    None where they are not, or the law has terms, which are not linear.
+    """
+    controller, ticks = setting.controller, setting.ticks
+    if setting.linear.compensation is not None:
+        return None
+    try:
+        match = match_lines(controller, ticks)
+    except LogError:
+        return None
+    factor = match.factor
+    if not match.is_near(1.0) and not match.is_near(factor):
+        return None
+    met, name, limit = match.is_near(1.0), controller.command.input, setting.linear.command_limit
+    kind = "sign" if abs(factor + 1.0) < SAME_FACTOR else "factor"
+    cause = Cause(kind=kind, what=name, value=factor, unit="", removes=1.0, explains=True)
+    return Replay(
+        met=met,
+        ticks=len(ticks),
+        mismatch=match.size * float(np.sqrt(np.mean(match.off**2))),
+        largest=match.size * float(np.max(match.off)),
+        allowed=match.size * float(np.sqrt(np.mean(match.radius[match.sure] ** 2))),
+        rms=float(np.std(ticks.command)),
+        off_from=None,
+        saturated=find_saturated(ticks, limit),
+        command_late=match.late,
+        rate_hz=ticks.rate_hz,
+        law_rate_hz=1.0 / controller.sample_time_s,
+        ticks_per_row=ticks_per_row,
+        causes=() if met else (cause,),
+    )
+
+
+def find_saturated(ticks: Ticks, limit: float) -> float:
+    """Return the share of the ticks at the limit."""
+    return float(np.mean(np.abs(ticks.command) >= AT_LIMIT * limit)) if math.isfinite(limit) else 0.0
 
 
 def play(setting: Setting) -> Match:

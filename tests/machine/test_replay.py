@@ -135,3 +135,27 @@ def test_a_law_with_gravity_compensation_is_replayed_from_the_middle_of_a_run_an
     assert so.accept(law, [log]).replayed
     cause = cause_of(law, so.Log.from_arrays(**columns, I=0.5 * run.current[0][late]))
     assert (cause.kind, cause.what) == ("factor", "I") and np.isclose(cause.value, 0.5)
+
+
+GENTLE = multisine(1000, LINES, 8, 60.0, 3, bias=300.0)
+
+
+@pytest.mark.parametrize("late", [0, 1, -1])
+def test_a_log_of_every_second_tick_is_compared_at_its_lines(controller, bench, late):
+    log = bench.log(Machine(), GENTLE)
+    rows = slice(2, GENTLE.size - 2, 2)
+    columns = {name: log[name][rows] for name in ("reference", "F1")} | {"time": log.time[rows]}
+    columns["I"] = np.roll(log["I"], late)[rows]
+    result = so.accept(controller, [so.Log.from_arrays(**columns)])
+    (row,) = result.replays
+    assert row.met and (row.ticks_per_row, row.command_late) == (2, late), result
+    assert result.differences.inside and "refuted" not in {each.outcome for each in result.response.judged}
+    columns["I"] = 0.5 * columns["I"]
+    cause = cause_of(controller, so.Log.from_arrays(**columns))
+    assert (cause.kind, cause.what) == ("factor", "I") and np.isclose(cause.value, 0.5, rtol=0.01)
+
+
+def test_a_log_of_every_second_tick_of_another_law_is_refused(controller, bench):
+    log = bench.log(replace(Machine(), reading_sign=-1.0), GENTLE).between(0.0, 9.9)
+    columns = {name: log[name][::2] for name in ("reference", "F1", "I")}
+    assert not so.accept(controller, [so.Log.from_arrays(time=log.time[::2], **columns)]).replayed

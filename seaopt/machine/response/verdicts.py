@@ -22,16 +22,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from seaopt.control import Controller
 from seaopt.control.loops.measured.loop import bound_disc
 from seaopt.control.loops.peaks import HALF_POWER
-from seaopt.machine.discs import Ratio
-from seaopt.machine.periods import Blocks
+from seaopt.machine.response.discs import Ratio
+from seaopt.machine.response.judged import Judged, Measured, Outcome
+from seaopt.machine.response.measured_margins import list_margins
+from seaopt.machine.response.periods import Blocks
 from seaopt.plants.friction import find_dry_friction
 from seaopt.records import record
 
@@ -46,43 +48,6 @@ FEWEST_LINES = 8
 MOST_PERIODS = 1e6  # that are asked for
 NYQUIST = 0.8  # of half the sample rate, above which no line has to lie
 ON_GRID = 0.05  # relative, by which the outermost lines may miss, which lie on multiples of the period's
-Outcome = Literal["confirmed", "refuted", "undecided"]
-
-
-@record
-class Judged:
-    """A figure of the measured loop, and what the log says of its limit."""
-
-    name: str
-    limit: float | None  # as judged: with the grace
-    sense: Literal["at most", "at least"]
-    value: float | None  # estimated
-    low: float | None  # the interval, at the confidence that is stated
-    high: float | None
-    unit: str
-    outcome: Outcome
-    where_hz: float | None  # the line that decides, or is the nearest to deciding
-    periods: int | None  # in all, that would decide where it is undecided
-
-
-@record(eq=False)
-class Measured:
-    """The response at one amplitude."""
-
-    f: Float[np.ndarray, " m"]
-    loop: Ratio  # L
-    tracking: Ratio  # Y/R of the regulated output
-    plants: tuple[Ratio, ...]  # of each signal, per effort
-    periods: int
-    blocks: int
-    phases: int
-    amplitude: float
-    saturated: int  # periods that were left out
-
-    @property
-    def distance(self) -> Complex[np.ndarray, " m"]:
-        """1 + L."""
-        return 1.0 + self.loop.value
 
 
 @record(eq=False)
@@ -168,6 +133,7 @@ def judge_response(controller: Controller, groups: Sequence[Blocks], confidence:
         _judge_stability(controller, measured, alpha),
         *_judge_peaks(controller, measured, alpha),
         _judge_bandwidth(controller, measured, alpha),
+        *list_margins(controller, measured, alpha),
     ]
     if needs_phases:  # nothing is confirmed, for the discs do not hold the truth
         rows = [_leave_open(row) for row in rows]
@@ -246,9 +212,11 @@ def _judge_stability(controller: Controller, measured: Sequence[Measured], alpha
 def _judge_peaks(controller: Controller, measured: Sequence[Measured], alpha: float) -> list[Judged]:
     spec, rows = controller.spec, list[Judged]()
     ms, mt, peak = (spec.level(name) for name in ("max_sensitivity", "max_complementary", "max_reference_peak"))
-    rows.append(_judge_sensitivity(ms, measured, alpha))
-    rows.append(_judge_discs("Mt", mt, measured, alpha, _bound_complementary))
-    rows.append(_judge_discs("reference peak", peak, measured, alpha, _bound_tracking(controller)))
+    figures = controller.achieved
+    rows.append(replace(_judge_sensitivity(ms, measured, alpha), predicted=figures.ms))
+    rows.append(replace(_judge_discs("Mt", mt, measured, alpha, _bound_complementary), predicted=figures.mt))
+    tracked = _judge_discs("reference peak", peak, measured, alpha, _bound_tracking(controller))
+    rows.append(replace(tracked, predicted=figures.reference_peak))
     return rows
 
 
@@ -380,7 +348,7 @@ def _judge_bandwidth(controller: Controller, measured: Sequence[Measured], alpha
     return Judged(
         name="bandwidth", limit=limit if tracked else None, sense="at least", value=min(values), low=min(lows),
         high=high if math.isfinite(high) else None, unit="Hz", outcome=outcome, where_hz=where,
-        periods=_count_periods(outcome, needed),
+        periods=_count_periods(outcome, needed), predicted=controller.achieved.bandwidth_hz if tracked else None,
     )  # fmt: skip
 
 

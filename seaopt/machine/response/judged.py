@@ -1,0 +1,50 @@
+"""A figure of the measured loop with what the log says of it, and the response at one amplitude."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.machine.response.discs import Ratio
+from seaopt.records import record
+
+Outcome = Literal["confirmed", "refuted", "undecided"]
+
+
+@record
+class Judged:
+    """A figure of the measured loop, and what the log says of its limit."""
+
+    name: str
+    limit: float | None  # as judged: with the grace
+    sense: Literal["at most", "at least"]
+    value: float | None  # estimated
+    low: float | None  # the interval, at the confidence that is stated
+    high: float | None
+    unit: str
+    outcome: Outcome
+    where_hz: float | None  # the line that decides, or is the nearest to deciding
+    periods: int | None  # in all, that would decide where it is undecided
+    predicted: float | None = None  # of the design plant
+
+
+@record(eq=False)
+class Measured:
+    """The response at one amplitude."""
+
+    f: Float[np.ndarray, " m"]
+    loop: Ratio  # L
+    tracking: Ratio  # Y/R of the regulated output
+    plants: tuple[Ratio, ...]  # of each signal, per effort
+    periods: int
+    blocks: int
+    phases: int
+    amplitude: float
+    saturated: int  # periods that were left out
+
+    @property
+    def distance(self) -> Complex[np.ndarray, " m"]:
+        """1 + L."""
+        return 1.0 + self.loop.value

@@ -1,0 +1,79 @@
+r"""Gain, phase and delay margin of a measured loop, between the lines where it crosses -180 degrees and a gain of one.
+
+Between neighbouring lines the loop gain is taken as a straight line in :math:`\ln|L|` and phase over
+:math:`\ln f`. A disc of radius R about L allows :math:`\rho = R/|L|` of gain and as many radians of phase, so that
+
+.. math:: |\Delta \ln g| \le \rho\,(1 + |\mathrm d\ln|L|/\mathrm d\varphi|), \qquad
+          |\Delta\varphi| \le \rho\,(1 + |\mathrm d\varphi/\mathrm d\ln|L||) .
+
+The specification has no limit of these margins: they stand beside what was predicted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.control import Controller
+from seaopt.machine.response.judged import Judged, Measured
+
+DECIBEL = 20.0 / math.log(10.0)
+STEEPEST = 10.0  # of one over the other, beyond which a crossing is not told
+
+
+def list_margins(controller: Controller, measured: Sequence[Measured], alpha: float) -> list[Judged]:
+    """Return the margins of a measured loop, the smallest of all amplitudes; those that it crosses for."""
+    figures = controller.achieved
+    predicted = {
+        "gain margin": figures.gain_margin_db,
+        "phase margin": figures.phase_margin_deg,
+        "delay margin": None if figures.delay_margin_s is None else 1e3 * figures.delay_margin_s,
+    }
+    smallest: dict[str, Judged] = {}
+    for row in (row for part in measured for row in _find_margins(part, alpha)):
+        before = smallest.get(row.name)
+        if before is None or (row.value is not None and before.value is not None and row.value < before.value):
+            smallest[row.name] = row
+    return [_predict(smallest[name], value) for name, value in predicted.items() if name in smallest]
+
+
+def _predict(row: Judged, predicted: float | None) -> Judged:
+    """Return a row with what was predicted, where that is a number."""
+    return replace(row, predicted=predicted if predicted is not None and math.isfinite(predicted) else None)
+
+
+def _find_margins(part: Measured, alpha: float) -> Iterator[Judged]:
+    """Yield the margins at each crossing of a loop."""
+    loop, radius = part.loop.disc(alpha)
+    size, phase, at = np.log(np.abs(loop)), np.unwrap(np.angle(loop)), np.log(part.f)
+    phase = phase - 2.0 * np.pi * round((phase[0] + 0.5 * np.pi) / (2.0 * np.pi))  # begins about -90 degrees
+    share = radius / np.abs(loop)
+    for k in range(part.f.size - 1):
+        rise, turn, error = size[k + 1] - size[k], phase[k + 1] - phase[k], float(max(share[k], share[k + 1]))
+        for over in (-math.pi, -3.0 * math.pi):
+            if (phase[k] - over) * (phase[k + 1] - over) <= 0.0 and turn:
+                t = (over - phase[k]) / turn
+                wide = DECIBEL * error * (1.0 + min(abs(rise / turn), STEEPEST))
+                yield _make("gain margin", -DECIBEL * float(size[k] + t * rise), wide, "dB", _hertz(at, k, t))
+        if size[k] * size[k + 1] <= 0.0 and rise:
+            t = -size[k] / rise
+            left = math.pi + float(phase[k] + t * turn)
+            wide, hertz = error * (1.0 + min(abs(turn / rise), STEEPEST)), _hertz(at, k, t)
+            yield _make("phase margin", math.degrees(left), math.degrees(wide), "deg", hertz)
+            per = 1e3 / (2.0 * math.pi * hertz)
+            yield _make("delay margin", per * left, per * (wide + abs(left) * error), "ms", hertz)
+
+
+def _hertz(at: np.ndarray, k: int, t: float) -> float:
+    return float(np.exp(at[k] + t * (at[k + 1] - at[k])))
+
+
+def _make(name: str, value: float, wide: float, unit: str, hertz: float) -> Judged:
+    low, high = (value - wide, value + wide) if math.isfinite(wide) else (None, None)
+    return Judged(
+        name=name, limit=None, sense="at least", value=value, low=low, high=high, unit=unit, outcome="undecided",
+        where_hz=hertz, periods=None,
+    )  # fmt: skip
