@@ -51,7 +51,7 @@ class LineMatch:
     @property
     def factor(self) -> float:
         """What the command is times the law's, at the line in the middle of these."""
-        return float(np.median(self.ratio.real[self.sure])) if np.any(self.sure) else 1.0
+        return float(np.median(np.real(self.ratio)[self.sure])) if np.any(self.sure) else 1.0
 
     def is_near(self, factor: float) -> bool:
         """Tell whether the command is a factor times the law's at every line, of which enough say something."""

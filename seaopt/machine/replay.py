@@ -520,9 +520,13 @@ def _list_places(setting: Setting) -> Iterator[Alternative]:
         change = _change_ticks(lambda rows, point=point: replace(rows, place=np.full(len(rows), point)))
         yield Alternative(kind="place", what=over, value=point, unit=law.table.unit, change=change)
     for factor in (-1.0, *UNITS):
-        change = _change_ticks(lambda rows, factor=factor: replace(rows, place=factor * rows.place))
+        change = _change_ticks(lambda rows, factor=factor: _scale_place(rows, factor))
         kind = "sign" if factor < 0.0 else "unit"
         yield Alternative(kind=kind, what=over, value=factor, change=change)
+
+
+def _scale_place(ticks: Ticks, factor: float) -> Ticks:
+    return replace(ticks, place=None if ticks.place is None else factor * ticks.place)
 
 
 def _make_law(controller: Controller, gains: Gains, sample_time_s: float | None = None) -> Callable[[Setting], Setting]:

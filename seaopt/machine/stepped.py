@@ -116,7 +116,9 @@ def list_starts(setting: Setting) -> Iterator[tuple[State, int]]:
     first = ticks.measured[0]
     measured: Any = float(first[0]) if law.measured == 1 else first
     command = float(np.clip(ticks.command[0], -law.command_limit, law.command_limit))
-    placed = {} if isinstance(law, RunnableLaw) else {"place": math.nan if ticks.place is None else ticks.place[0]}
+    placed: dict[str, Any] = (
+        {} if isinstance(law, RunnableLaw) else {"place": math.nan if ticks.place is None else ticks.place[0]}
+    )
     try:
         yield (
             law.reset(

@@ -193,7 +193,8 @@ class RunnableSchedule(Guarded):
         unit, still, nothing = np.eye(n + 1 + y), np.zeros(n), np.zeros(y)
         columns = np.array([respond(row[:n], row[n], row[n + 1 :], math.inf, 0.0) for row in unit]).T
         wound = respond(still, 0.0, nothing, 0.0, 1.0) - respond(still, 0.0, nothing, math.inf, 1.0)
-        kept = {field.name: getattr(self, field.name) for field in fields(Guarded)} | {"compensation": compensation}
+        kept: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(Guarded)}
+        kept["compensation"] = compensation
         return RunnableLaw(
             **kept,
             a=columns[:n, :n],
