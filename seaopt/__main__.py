@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+from contextlib import suppress
 from typing import NoReturn
+
+from seaopt import __version__
 
 
 def main() -> None:
     """Run the command line."""
+    if sys.argv[1:] == ["--version"]:  # asked by scripts, and all else that a command loads takes ten times as long
+        with suppress(OSError):  # nobody reads it
+            os.write(1, f"seaopt {__version__}\n".encode())
+        return
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:  # else nobody may interrupt it, as below nohup
         signal.signal(signal.SIGINT, _leave)  # an import that is interrupted may raise anything, anywhere

@@ -32,6 +32,16 @@ MAX_POWERS = 6
 _TOKEN = re.compile(r"[A-Za-zµμΩ°%]+")
 
 
+COMMON_SI = ("", "m", "s", "kg", "N", "A", "rad", "N m", "m/s", "rad/s", "m/s^2", "V", "rad/s^2", "K", "Hz", "W")
+# What nearly all logs are in, in SI: asking pint takes half a second the first time.
+_USUAL = {
+    **{unit: (unit, 1.0) for unit in COMMON_SI}, **dict.fromkeys(DIMENSIONLESS, ("", 1.0)), "Nm": ("N m", 1.0),
+    "ms": ("s", 1e-3), "us": ("s", 1e-6), "mA": ("A", 1e-3), "mV": ("V", 1e-3), "mm": ("m", 1e-3), "kN": ("N", 1e3),
+    "deg": ("rad", 0.0174532925199433), "deg/s": ("rad/s", 0.0174532925199433), "rpm": ("rad/s", 0.10471975511966),
+}  # fmt: skip
+_PURE = {"rad": "", "rad/s": "Hz"}  # of what dimension angles are as pure numbers
+
+
 @lru_cache(maxsize=1)
 def _registry() -> pint.UnitRegistry[Any]:
     import pint  # deferred: 0.2 s
@@ -71,6 +81,9 @@ def factor(unit: str, to: str) -> float:
     """
     if unit.strip() == to.strip():
         return 1.0
+    si, scale = _USUAL.get(unit.strip(), (None, 1.0))
+    if si is not None and si == to.strip():
+        return scale
     source, target = _parse(unit), _parse(to)
     if source.dimensionality != target.dimensionality:
         raise UnitError(f'unit "{unit}" is not one of {to or "a pure number"}; give a unit with that dimension')
@@ -80,14 +93,13 @@ def factor(unit: str, to: str) -> float:
     return float(f"{scale:.15g}")
 
 
-COMMON_SI = ("", "m", "s", "kg", "N", "A", "rad", "N m", "m/s", "rad/s", "m/s^2", "V", "rad/s^2", "K", "Hz", "W")
-
-
 @lru_cache(maxsize=1024)
 def si_unit(unit: str) -> str:
     """Return the SI unit of the same dimension, as text: "mA" gives "A", "deg" gives "rad"; "degC" is its own."""
     if unit.strip() in CELSIUS:  # the offset against K makes it a unit of its own
         return "degC"
+    if unit.strip() in _USUAL:
+        return _USUAL[unit.strip()][0]
     parsed = _parse(unit)
     angular = "radian" in str(_registry().Quantity(1, parsed).to_root_units().units)
     for candidate in COMMON_SI:
@@ -107,6 +119,9 @@ def is_unit(text: str) -> bool:
 
 def same_dimension(first: str, second: str) -> bool:
     """Return whether two unit texts have the same dimension (angles count as pure numbers, as in SI)."""
+    if first.strip() in _USUAL and second.strip() in _USUAL:
+        one, other = _USUAL[first.strip()][0], _USUAL[second.strip()][0]
+        return _PURE.get(one, one) == _PURE.get(other, other)
     return bool(_parse(first).dimensionality == _parse(second).dimensionality)
 
 

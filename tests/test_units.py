@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import pytest
 
 from seaopt import units
 from seaopt.errors import UnitError
+from seaopt.plants.equations.declaration import PLAIN_UNIT
 from seaopt.units import factor, same_dimension, si_unit
 
 
@@ -66,3 +69,30 @@ def test_quantities_of_linear_and_rotary_actuators():
     assert (units.ROTARY.stiffness, units.ROTARY.impulse) == ("N m/rad", "N m s")
     assert units.mechanics_of("N m").word == "torque"
     assert (units.mechanics_of("rad").inertia, units.mechanics_of("N").word) == ("kg m^2", "force")
+
+
+def test_usual_units_are_what_pint_makes_of_them(monkeypatch):
+    usual = dict(units._USUAL)
+    pairs = [(unit, other) for unit in usual for other in usual]
+    quick = {pair: same_dimension(*pair) for pair in pairs}
+    monkeypatch.setattr(units, "_USUAL", {})
+    for unit, (si, scale) in usual.items():
+        assert si_unit.__wrapped__(unit) == si
+        assert factor.__wrapped__(unit, si) == scale
+    assert {pair: same_dimension(*pair) for pair in pairs} == quick
+
+
+@pytest.mark.parametrize("unit", ["m", "1/(N m)", "m/(N m)", "kg m^2", "N m s/rad", "1/K", "N/m^3", "W/K", "N s^2/m/A"])
+def test_units_of_plants_that_are_not_looked_up_are_pints(unit):
+    assert PLAIN_UNIT.fullmatch(unit)
+    assert units._parse(unit) is not None
+
+
+@pytest.mark.parametrize("unit", ["m//s", "m/", "(m", "m m)", "N m/(s", "flurb", "m^", "1/1/", "kg^22", "m  s"])
+def test_units_that_are_looked_up(unit):
+    assert not PLAIN_UNIT.fullmatch(unit)
+
+
+def test_usual_units_need_no_pint():
+    code = "import sys; from seaopt.units import factor, si_unit; factor('deg', 'rad'); sys.exit('pint' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -39,7 +39,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.special import polygamma
 
 from seaopt.control.impedance.link import ControlledLink
 from seaopt.control.loops.absolute_stability import refine_angles
@@ -196,6 +195,8 @@ def _add_beyond(terms: Aliases, over_floor: Float[np.ndarray, "m k"], theta: Ang
     """Return terms that fall at least like 1/omega^2 with the sum beyond the last alias on either side. It is summed as
     if they fell no faster from there, and as if the port dissipated its least.
     """
+    from scipy.special import polygamma  # deferred: scipy is slow to load
+
     turns = theta / (2 * np.pi)
     sides = [
         terms[:, end] * over_floor[:, end] * (ALIASES + sign * turns) ** 2 * polygamma(1, ALIASES + 1 + sign * turns)

@@ -42,7 +42,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
-from scipy.special import polygamma
 
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.records import record
@@ -189,6 +188,8 @@ class LoopResponses:
 
 def find_responses(loop: FrictionLoop, theta: Angles, *, feedback: bool = True) -> LoopResponses:
     """Return G_v, a (without M) and b at angles; b of each signal, per unit of its K, without the feedback."""
+    from scipy.special import polygamma  # deferred: scipy is slow to load
+
     period, root = loop.plant.sample_time_s, np.sqrt(loop.slopes)
     seen = np.vstack([root[:, None] * loop.velocity, loop.sensed])  # phi = slope v: the slope of phi / root is 1
     response, ports = loop.respond(theta, ORDERS, seen), len(root)

@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Complex, Float
 from numpy.polynomial.polynomial import polypow
-from scipy.linalg import block_diag
 
 from seaopt.control.loops.minimal import (
     NEAR_ONE,
@@ -294,6 +293,8 @@ class Law:
 
     def reading(self, feedback: TransferFunction) -> Law:
         """Return the law u - C(q) y that reads one signal more, in a last column of b."""
+        from scipy.linalg import block_diag  # deferred: scipy is slow to load
+
         a, b, c, d = feedback.state_space()
         return replace(
             self,

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.linalg import block_diag, matrix_balance, schur, solve_sylvester
 
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
@@ -97,6 +96,8 @@ def realise_rest(
     side by side. The direct terms, Y at q = 0, are left out. The form is of polynomials in z - 1, in which slow poles
     have digits that they do not have in z, with its states scaled.
     """
+    from scipy.linalg import block_diag  # deferred: scipy is slow to load
+
     groups: dict[tuple[float, ...], list[int]] = {}  # by denominator
     for number, (_, den) in enumerate(parts):
         groups.setdefault(tuple(den), []).append(number)
@@ -162,6 +163,8 @@ def split_integrators(
     rounding. The mean is known to :math:`\epsilon |A| \sqrt{1 + |X|^2}` (Golub, Van Loan, Matrix Computations, 7.2),
     and not taken for 1 where that is more than `NEAR_ONE`: slow poles beside it then hide where it lies.
     """
+    from scipy.linalg import schur, solve_sylvester  # deferred: scipy is slow to load
+
     # States of very different units would leave the Schur form's poles less exact than these, which are of scaled ones.
     scaled, scale = _scale(a)
     b_scaled, c_scaled = b / scale[:, None], c * scale
@@ -210,6 +213,8 @@ def read_companion(
 
 def _scale(a: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
     """Return a matrix with rows and columns of like norms, and each state's factor."""
+    from scipy.linalg import matrix_balance  # deferred: scipy is slow to load
+
     if not a.size:
         return a, np.zeros(0)
     scaled, (scale, _) = matrix_balance(a, permute=False, separate=True)
@@ -253,6 +258,8 @@ def balance(
     largest Hankel singular value, is rounding. Raises LinAlgError: a pole is so close to the unit circle that a Gramian
     is not finite.
     """
+    from scipy.linalg import schur  # deferred: scipy is slow to load
+
     a, turn = (np.asarray(part) for part in schur(a))  # powers of a triangle keep its poles, of a companion form not
     b, c = turn.T @ b, c @ turn
     reach, show = _factor(a, b), _factor(a.T, c[:, None])

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import block_diag
 
 from seaopt.codec import OrInfinite, OrMinusInfinite
 from seaopt.control.laws.delay import Drive
@@ -211,6 +210,8 @@ def combine_uncertainty(
     ControlError
         The fit leaves a parameter undetermined, or a range is empty or names nothing.
     """
+    from scipy.linalg import block_diag  # deferred: scipy is slow to load
+
     plant_names = {name for plant in plants.values() for name in plant.parameters}
     check_ranges(ranges, plants)
     if isinstance(source, Fit):

@@ -42,7 +42,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.optimize import minimize_scalar
 
 from seaopt.control.loops.absolute_stability import (
     ORDERS,
@@ -197,6 +196,8 @@ class _MultiplierTest:
 
     def find_least_inverse(self, shift: str) -> _LeastInverse:
         """Return the least 1/kappa_c that the test allows at all angles."""
+        from scipy.optimize import minimize_scalar  # deferred: scipy is slow to load
+
         at, n = self.at, _shift(shift, np.exp(1j * self.at.friction.theta))
         u = np.zeros((n.size, 3, 2), dtype=complex)  # of u the part without lambda, and that with it
         u[:, 0, 0], u[:, 1, 1], u[:, 2, 1] = 0.5 * at.sensitivity, 0.5 * np.conj(n * at.through), -0.5 * np.conj(n)
