@@ -28,19 +28,22 @@ SOURCE = """#include "reference.h"
 #define PERIODS {periods}UL
 #define PHASES {phases}UL
 
-static const double fade[PERIOD] = {{
-{fade}
-}};
-static const double wave[PHASES][PERIOD] = {{
+static const float wave[PHASES][PERIOD] = {{
 {waves}
 }};
+
+static double fade(unsigned long tick)
+{{
+    const double share = (double)tick / (double)PERIOD;
+    return share * share * (3.0 - (2.0 * share));
+}}
 
 double stage_reference(unsigned long tick)
 {{
     const unsigned long played = PHASES * PERIODS * PERIOD;
-    if (tick < PERIOD) return fade[tick] * wave[0][tick];
-    if (tick < PERIOD + played) return wave[(tick - PERIOD) / (PERIODS * PERIOD)][tick % PERIOD];
-    if (tick < STAGE_TICKS) return fade[STAGE_TICKS - 1UL - tick] * wave[PHASES - 1UL][tick % PERIOD];
+    if (tick < PERIOD) return fade(tick) * (double)wave[0][tick];
+    if (tick < PERIOD + played) return (double)wave[(tick - PERIOD) / (PERIODS * PERIOD)][tick % PERIOD];
+    if (tick < STAGE_TICKS) return fade(STAGE_TICKS - 1UL - tick) * (double)wave[PHASES - 1UL][tick % PERIOD];
     return 0.0;
 }}
 """
@@ -83,8 +86,8 @@ def _write_stage(stage: Stage, folder: Path, tare: Tare | None) -> list[Path]:
     period, phases = excitation.waves.shape[1], len(excitation.waves)
     waves = ",\n".join(f"{{\n{_list_numbers(excitation.bias + wave)}\n}}" for wave in excitation.waves)
     words = {"phases": phases, "period": period, "periods": excitation.periods, "ticks": reference.size, "unit": unit}
-    header = HEADER.format(**words, bytes=8 * period * (1 + phases), rate=f"{1.0 / excitation.sample_time_s:.10g}")
-    source = SOURCE.format(**words, fade=_list_numbers(excitation.fade), waves=waves)
+    header = HEADER.format(**words, bytes=4 * period * phases, rate=f"{1.0 / excitation.sample_time_s:.10g}")
+    source = SOURCE.format(**words, waves=waves)
     return [
         *export(stage.controller, folder, allow_infeasible=True, log_rows=LOG_ROWS, tare=tare),
         write_json(folder / "controller.json", stage.controller.to_dict()),
@@ -97,7 +100,7 @@ def _write_stage(stage: Stage, folder: Path, tare: Tare | None) -> list[Path]:
 
 
 def _list_numbers(values: np.ndarray) -> str:
-    texts = [f"{value:.9g}" for value in values.tolist()]
+    texts = [f"{value:.8e}f" for value in values.tolist()]
     return ",\n".join(", ".join(texts[k : k + PER_LINE]) for k in range(0, len(texts), PER_LINE))
 
 
