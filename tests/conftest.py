@@ -119,6 +119,7 @@ if os.environ.get("SEAOPT_TYPES") != "0":  # long tests make calls that the quic
 
 import seaopt as so  # noqa: E402
 from seaopt.bench import PAPER_STAND  # noqa: E402
+from seaopt.estimation.judgement.hypothesis_search import Search  # noqa: E402
 from seaopt.simulation.native import find_compiler  # noqa: E402
 from tests import simulated_logs  # noqa: E402
 
@@ -205,6 +206,13 @@ def stand_log(stand, thor) -> so.Log:
 def short_log(stand, thor) -> so.Log:
     sensors = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}, offset={"F1": 3.0})
     return so.virtual_log(stand, thor, PAPER_STAND, duration_s=20, rate_hz=400, seed=12, sensors=sensors)
+
+
+@pytest.fixture
+def without_causes(monkeypatch):
+    """Let fits look for nothing that explains a misfit better: most of such a fit's time, and no std depends on it."""
+    monkeypatch.setattr("seaopt.estimation.judgement.judge.find_causes", lambda *_, **__: [])
+    monkeypatch.setattr("seaopt.estimation.judgement.judge.search_hypotheses", lambda *_, **__: Search())
 
 
 @pytest.fixture

@@ -80,10 +80,11 @@ from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter, declare
 from seaopt.plants import drives
 from seaopt.plants.friction import can_stick
+from seaopt.plants.memo import memo
 from seaopt.plants.motor import effects
 from seaopt.plants.motor.thermal import PARAMETERS, add_heat
 from seaopt.plants.plant import Plant, agree
-from seaopt.plants.roles import Recipe, change_ports, put_behind
+from seaopt.plants.roles import change_ports, put_behind
 from seaopt.plants.sensors.deflection import PARTS as SENSOR_PARTS
 from seaopt.plants.sensors.deflection import keep_weights, read_deflection
 from seaopt.records import record
@@ -409,10 +410,11 @@ def wrapped(
     return plant
 
 
+@memo
 def add_part(plant: Plant, part: str) -> Plant:
     """Return a plant with one more part, made again where it can be. Raises PlantError: the two do not go together."""
     recipe = plant.recipe
-    if recipe is None or not _makes(recipe, plant):
+    if recipe is None or not _is_made(plant):
         made = wrapped(plant, [part])
     else:
         check_parts((*recipe.parts, part))
@@ -420,9 +422,11 @@ def add_part(plant: Plant, part: str) -> Plant:
     return replace(made, sticks=plant.sticks and can_stick(made), drive_offset_s=plant.drive_offset_s)
 
 
-def _makes(recipe: Recipe, plant: Plant) -> bool:
-    """Tell whether a recipe makes a plant, at one point; states and outputs that a device adds are its own."""
-    made = recipe.make(recipe.parts)
+@memo
+def _is_made(plant: Plant) -> bool:
+    """Tell whether its recipe makes a plant, at one point; states and outputs that a device adds are its own."""
+    assert plant.recipe is not None
+    made = plant.recipe.make(plant.recipe.parts)
     if tuple(made.parameters) != tuple(plant.parameters) or tuple(made.inputs) != tuple(plant.inputs):
         return False
     if not (made.states.keys() <= plant.states.keys() and made.outputs.keys() <= plant.outputs.keys()):

@@ -103,9 +103,3 @@ def seaopt(folder, monkeypatch, capsys):
 def without_simulation(monkeypatch):
     """Let `certify` leave out the simulations: the finished run has them."""
     leave_out(monkeypatch, SIMULATIONS)
-
-
-@pytest.fixture
-def without_causes(monkeypatch):
-    """Let fits that are not met look for no cause: it takes most of their time."""
-    monkeypatch.setattr("seaopt.estimation.judgement.judge.find_causes", lambda *_, **__: [])

@@ -216,8 +216,8 @@ def test_no_motor_is_rated_by_defaults_that_nobody_gave():
         rate_motor(PLANT, so.ParameterSet(one for name, one in VALUES.items() if name != "C_c"))
 
 
-def test_a_fit_names_what_of_the_motors_heat_is_a_guess(monkeypatch):
-    monkeypatch.setattr("seaopt.estimation.judgement.judge.find_causes", lambda *_, **__: [])  # most of the time
+@pytest.mark.usefixtures("without_causes")
+def test_a_fit_names_what_of_the_motors_heat_is_a_guess():
     cold = so.plants.rotary(link="locked").defaults.free("k_s")
     time = np.arange(400) * 1e-3
     log = so.simulate(PLANT, VALUES, so.Log.from_arrays(time=time, I=np.sin(40.0 * time)))

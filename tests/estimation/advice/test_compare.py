@@ -16,15 +16,10 @@ from seaopt.errors import EstimationError
 from seaopt.estimation import compare
 from seaopt.files import to_json
 
+pytestmark = pytest.mark.usefixtures("without_causes")  # which no comparison reads
 ROOT = Path(__file__).parents[3]
 DRIVES = ("unlumped", "lumped")
 NOISE = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
-
-
-@pytest.fixture(autouse=True)
-def without_causes(monkeypatch):
-    """Let fits that are not met look for no cause, which no comparison reads: it takes most of their time."""
-    monkeypatch.setattr("seaopt.estimation.judgement.judge.find_causes", lambda *_, **__: [])
 
 
 def log_of(kind, drive, excitation, thor, **options):

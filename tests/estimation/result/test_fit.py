@@ -17,7 +17,6 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Noise
 from seaopt.errors import EstimationError, FileError
 from seaopt.estimation import Squares, profile
-from seaopt.estimation.judgement import judge
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.files import to_json
 
@@ -116,6 +115,7 @@ def test_misra1a_values_and_standard_errors_are_nists():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_causes")
 def test_intervals_cover_the_truth(stand, thor):
     """95 % intervals of J, b_r, eta over 60 seeds (180 intervals)."""
     inside = 0
@@ -132,6 +132,7 @@ def test_intervals_cover_the_truth(stand, thor):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_causes")
 def test_coloured_residuals_widen_the_intervals(stand, thor):
     """Noise with a correlation time of 0.1 s: the stated std matches the scatter of the estimates over seeds."""
     found, stated = [], []
@@ -164,6 +165,7 @@ def scatter(stand, thor, spoil, seeds, **options):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_causes")
 def test_noise_common_to_both_load_cells_widens_the_intervals(stand, thor):
     """Output by output, the stated std would be 1/sqrt(2) of the scatter."""
 
@@ -175,6 +177,7 @@ def test_noise_common_to_both_load_cells_widens_the_intervals(stand, thor):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_causes")
 def test_hubers_intervals_mean_what_they_say(stand, thor):
     def outliers(rng, f1, f2):
         hit = rng.random(f1.size) < 0.05
@@ -457,9 +460,9 @@ def test_how_far_a_value_is_from_its_start_has_few_digits(stand, short_log, thor
 
 @pytest.mark.slow
 @pytest.mark.parametrize("samples", [40, 100])
-def test_intervals_of_few_samples_are_not_far_too_narrow(stand, thor, samples, monkeypatch):
+@pytest.mark.usefixtures("without_causes")
+def test_intervals_of_few_samples_are_not_far_too_narrow(stand, thor, samples):
     """Windows of one log: what a fit takes out of few residuals may not narrow their intervals."""
-    monkeypatch.setattr(judge, "find_causes", lambda *_, **__: [])  # most of the time, and no interval depends on it
     log = so.virtual_log(stand, thor, PAPER_STAND, duration_s=40, rate_hz=400, seed=3,
                          sensors=so.Sensors(noise_std={"F1": 2.0, "F2": 2.0}))  # fmt: skip
     off = []

@@ -133,6 +133,7 @@ def fit_in_coloured_noise(clean, plant, seed):
     return tuple((each.delay_s - 2.3 / RATE) / each.std["delay_s"] for each in (own, plain))
 
 
+@pytest.mark.usefixtures("without_causes")
 @pytest.mark.parametrize("logs", [4, pytest.param(30, marks=pytest.mark.slow)])
 def test_the_std_of_a_delay_allows_for_coloured_noise(logs):
     """Of 30 logs the delays scatter as their stds say, which for white noise do not; of 4 none is far off."""

@@ -292,6 +292,7 @@ def test_soft_l1_shrugs_off_outliers(stand, thor):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_causes")
 def test_soft_l1_states_its_scatter_under_outliers(stand, thor):
     found, stated = [], []
     for seed in range(40):
