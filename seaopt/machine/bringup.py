@@ -14,6 +14,7 @@ from seaopt.control import Controller, ControllerSpec
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
+from seaopt.machine.design_run import run_design
 from seaopt.machine.excitation import Excitation, design_excitation
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
 from seaopt.parameters import ParameterSet
@@ -283,6 +284,7 @@ def _make_stage(
     dry = has_dry_friction(controller)
     phases, periods = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
     excitation = design_excitation(controller, phases=phases, periods=periods, **options)
+    excitation = replace(excitation, peaks=_add_terms(controller, excitation))
     assert controller.design is not None
     plant, values = controller.design
     sets = [values, *(place_values(plant, values, each) for each in draws)]
@@ -305,6 +307,18 @@ def _make_stage(
         stop={key: min(STOP * peak, excitation.limits.get(key, np.inf)) for key, peak in excitation.peaks.items()},
         note=note,
     )
+
+
+def _add_terms(controller: Controller, excitation: Excitation) -> dict[str, float]:
+    """Return the peaks of a reference with the terms of a law, and where one set of phases follows another: those of a
+    run where they are larger.
+    """
+    peaks = dict(excitation.peaks)
+    if controller.design is None or (controller.compensation is None and len(excitation.waves) == 1):
+        return peaks
+    run = run_design(controller, [controller.design[1]], excitation.reference)
+    signals = {**run.outputs, controller.command.input: run.current}
+    return {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
 
 
 def _band(at: Float[np.ndarray, " m"], rows: Any) -> Band:

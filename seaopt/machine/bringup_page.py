@@ -10,7 +10,7 @@ import numpy as np
 
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup import Band, BringUp, Stage
-from seaopt.reporting.figures.panel import BAND, BLUE, Panel, frequency_panel, to_decibel
+from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -20,7 +20,7 @@ from seaopt.units import unit_after
 PARTS = {"stages": "Stages", "provenance": "Provenance"}
 ALWAYS = (
     "a signal is beyond its figure below.",
-    "`held` grows, or `status` is the fault of the gate: the law has lost its reading.",
+    "held grows, or status is the fault of the gate: the law has lost its reading.",
     "a tone is heard, or the command alternates from tick to tick: the loop is near its limit.",
 )
 NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
@@ -100,9 +100,9 @@ def _describe_stage(stage: Stage) -> Section:
             name,
             f"{format_number(peak, 3)}{unit_after(units.get(name, ''))}",
             f"{format_number(stage.stop[name], 3)}{unit_after(units.get(name, ''))}",
-            format_number(excitation.limits.get(name), 3, ""),
+            f"{format_number(limit, 3)}{unit_after(units.get(name, ''))}" if limit is not None else "",
         )
-        for name, peak in excitation.peaks.items()
+        for name, peak, limit in ((name, peak, excitation.limits.get(name)) for name, peak in excitation.peaks.items())
     )
     table = Table(head=("signal", "expected at most", "stop beyond", "limit"), rows=rows, align="<>>>")
     return Section(title=f"Stage {stage.name}", part="stages", sentences=tuple(sentences), tables=(table,))
@@ -126,17 +126,25 @@ def _list_panels(stage: Stage) -> Iterator[Panel]:
     yield Panel(
         name=f"step_{stage.name}", title=f"{stage.name}: step", draw=draw_step, x="time [s]",
         y=(f"{unit} over the step [-]",), tight=True,
-        caption="The step must lie in the band, which is that of the certificate's draws.",
+        caption=f"The step must lie in the band, which is that of the certificate's draws, {_say_width(stage.step)}.",
     )  # fmt: skip
     yield frequency_panel(
         name=f"tracking_{stage.name}", title=f"{stage.name}: tracking", draw=draw_tracking, y=("|Y/R| [dB]",),
-        tight=True, caption="The measured response must lie in the band.",
+        tight=True, caption=f"The measured response must lie in the band, {_say_width(stage.tracking)}.",
     )  # fmt: skip
 
 
 def _draw_band(axis: Any, band: Band, scale: Any) -> None:
-    axis.fill_between(band.at, scale(band.low), scale(band.high), color=BAND, label="draws")
-    axis.plot(band.at, scale(band.nominal), color=BLUE, linewidth=1.3, label="expected")
+    axis.fill_between(band.at, scale(band.low), scale(band.high), color=BAND)
+    for edge, label in ((band.low, "band of the draws"), (band.high, None)):
+        axis.plot(band.at, scale(edge), color=VERMILION, linewidth=0.9, label=label)
+    axis.plot(band.at, scale(band.nominal), color=BLUE, linewidth=0.9, linestyle="--", label="expected")
+
+
+def _say_width(band: Band) -> str:
+    """Return how wide a band is, which a figure may not show."""
+    width = max(high - low for low, high in zip(band.low, band.high, strict=True))
+    return f"at most {format_number(100.0 * width / max(band.high), 2)} % of the largest value wide"
 
 
 def write_bring_up_page(

@@ -25,9 +25,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control import Controller, SampledLoop, run_loop, runnable
-from seaopt.control.loops.sampled_plant import DELAYS, find_delay, read_conditions
+from seaopt.control import Controller
+from seaopt.control.loops.sampled_plant import DELAYS
 from seaopt.logs.quality.faults import find_runs
+from seaopt.machine.design_run import run_design
 from seaopt.machine.response.periods import cut_periods, join_blocks, shorten
 from seaopt.machine.response.verdicts import Measured, has_dry_friction
 from seaopt.machine.ticks import Ticks
@@ -40,7 +41,6 @@ from seaopt.robustness.uncertainty.worst import place_values
 STEP = 0.02  # of a parameter, to see what it does
 ROUNDS = 4  # of Gauss and Newton
 FOUND = 1e-3  # of a factor's logarithm: it is found where it moves by less
-RTOL = 1e-4  # of their integration
 SIMULATED = 60  # draws that are simulated, with dry friction
 MOST_LOG = 1.5  # of a factor: its logarithm goes no further
 MOST_SPREAD = 10.0  # of a factor's logarithm, above which the log does not tell the factor
@@ -121,27 +121,16 @@ class Comparison:
         assert self.controller.design is not None
         plant = self.controller.design[0]
         if has_dry_friction(self.controller):
-            return self._simulate(plant, sets)
+            return self._simulate(sets)
         return [self._linearise(plant, values) for values in sets]
 
     def _linearise(self, plant: Plant, values: ParameterSet) -> Lines:
         seen = self.controller.plant(take_sliding(plant, values), values)
         return np.concatenate([seen.responses(part.f).ravel() for part in self.measured])
 
-    def _simulate(self, plant: Plant, sets: Sequence[ParameterSet]) -> list[Lines]:
+    def _simulate(self, sets: Sequence[ParameterSet]) -> list[Lines]:
         """Return the responses of the law on the nonlinear plant, under the logged references."""
-        controller, law = self.controller, runnable(self.controller, gate=False, heat=False)
-        values = [controller.delay(each) for each in sets]
-        seen = controller.see(plant)
-        longest = max(float(find_delay(seen, read_conditions(seen, seen.complete(each)))) for each in values)
-        loop = SampledLoop(
-            plant=seen,
-            law=law,
-            measured=controller.signals,
-            delay_samples=controller.compute_delay_samples,
-            longest_delay_s=longest,
-        )
-        runs = [run_loop(loop, values, ticks.reference, rtol=RTOL) for ticks in self.logs]
+        runs = [run_design(self.controller, sets, ticks.reference) for ticks in self.logs]
         return [self._cut([run.outputs for run in runs], k) for k in range(len(sets))]
 
     def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> Lines:

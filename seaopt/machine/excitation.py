@@ -27,6 +27,7 @@ LINES = 36
 LOWEST, HIGHEST = 1.0 / 30.0, 5.0  # of the bandwidth
 CLOSE = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the bandwidth: lines besides
 TRIES = 30  # sets of phases
+JOINED = 4  # ticks to either side of where a set of phases follows another, that are to be alike
 LONGEST_S = 4.0  # of a period, but where lines have to lie lower
 
 
@@ -98,7 +99,8 @@ def design_excitation(
         tried = [shape * np.exp(2j * np.pi * rng.uniform(size=lines.size)) for _ in range(TRIES)]
         command = per_reference[controller.command.input]
         best = min(tried, key=lambda sines: np.ptp(_play(sines * command, lines, period)))
-        waves.append(_play(best, lines, period))
+        wave = _play(best, lines, period)
+        waves.append(_follow(waves[-1], wave) if waves else wave)
         for name, response in per_reference.items():
             peak = float(np.max(np.abs(_play(best * response, lines, period))))
             peaks[name] = max(peaks.get(name, 0.0), peak)
@@ -145,6 +147,14 @@ def _play(sines: Complex[np.ndarray, " m"], lines: Int[np.ndarray, " m"], period
     spectrum = np.zeros(period // 2 + 1, dtype=complex)
     spectrum[lines] = 0.5 * period * sines
     return np.fft.irfft(spectrum, period)
+
+
+def _follow(before: Float[np.ndarray, " n"], wave: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return a period that begins where it goes on from another the most smoothly: a jump would take the command."""
+    around = np.arange(-JOINED, JOINED + 1)
+    starts = np.arange(wave.size)[:, None] + around
+    apart = np.sum((wave[starts % wave.size] - before[around]) ** 2, axis=1)
+    return np.roll(wave, -int(np.argmin(apart)))
 
 
 def _list_responses(controller: Controller, f: Float[np.ndarray, " m"]) -> tuple[list[str], Complex[np.ndarray, "y m"]]:

@@ -281,7 +281,8 @@ def summarise(result: Acceptance) -> list[KeyFigure]:
     for row in () if result.response is None else result.response.judged:
         if row.limit is not None and row.name != "stability":
             limit = f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}, {row.outcome}"
-            figures.append(KeyFigure(name=row.name, value=format_number(row.value, 3), against=limit))
+            value = f"{format_number(row.value, 3)}{unit_after(row.unit)}"
+            figures.append(KeyFigure(name=row.name, value=value, against=limit))
     return figures
 
 

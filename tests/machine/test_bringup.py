@@ -112,3 +112,20 @@ def test_what_cannot_be_played_is_refused(controller):
     ):
         with pytest.raises(so.SeaoptError, match=says):
             so.bring_up(controller, **options, **wrong)
+
+
+def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_whole_run():
+    from seaopt.control import CompensateFriction, add_compensation, run_loop
+    from seaopt.control.running.sampled_loop import SampledLoop
+
+    stand, values = so.plants.high_impedance(), so.plants.thor().update(f_c=300.0, v_s=5e-3)
+    law = so.tune(stand, values, so.ControllerSpec(bandwidth_hz=30, max_noise_gain=45, current_limit_A=9.0))
+    law = add_compensation(law, friction=CompensateFriction(fraction=0.8))
+    plan = so.bring_up(law, {"stand": stand}, values, samples=20, fractions=(), limits={"F1": 600.0})
+    excitation = plan.stages[0].excitation
+    period, rows = excitation.waves.shape[1], excitation.reference
+    joints = period * (1 + excitation.periods * np.arange(1, len(excitation.waves)))
+    assert np.max(np.abs(np.diff(rows)[joints - 1])) < np.max(np.abs(np.diff(rows[period : 2 * period])))
+    loop = SampledLoop(plant=stand, law=so.control.runnable(law), measured="F1", delay_samples=1)
+    run = run_loop(loop, [stand.complete(values)], rows, rtol=1e-4)
+    assert np.max(np.abs(run.current)) <= 1.001 * excitation.peaks["I"] < 0.8 * 9.0

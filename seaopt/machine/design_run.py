@@ -1,0 +1,30 @@
+"""A law on the nonlinear plant that it was designed for, under the reference that a log or a stage has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control import Controller, SampledLoop, run_loop, runnable
+from seaopt.control.loops.sampled_plant import find_delay, read_conditions
+from seaopt.control.running.closed_loop import LoopRun
+from seaopt.parameters import ParameterSet
+
+RTOL = 1e-4  # of the integration: a hundredth of what a disc tells
+
+
+def run_design(controller: Controller, sets: Sequence[ParameterSet], reference: Float[np.ndarray, " n"]) -> LoopRun:
+    """Return the runs of a law, with its terms and without its guards, on its design plant with each of some values."""
+    assert controller.design is not None
+    seen, values = controller.see(controller.design[0]), [controller.delay(each) for each in sets]
+    longest = max(float(find_delay(seen, read_conditions(seen, seen.complete(each)))) for each in values)
+    loop = SampledLoop(
+        plant=seen,
+        law=runnable(controller, gate=False, heat=False),
+        measured=controller.signals,
+        delay_samples=controller.compute_delay_samples,
+        longest_delay_s=longest,
+    )
+    return run_loop(loop, values, reference, rtol=RTOL)
