@@ -67,6 +67,8 @@ def accept_logs(
     with show_progress(errors, "judging the logs", errors.say) as tell:
         tell("reading the logs", 0.0)
         read = [read_loop_log(session.problem, log, units, reference) for log in logs]
+        for text in (f"note: {log.source}: {note}" for log in read for note in log.notes):
+            errors.wrap(text)
         result = accept(
             source,
             read,

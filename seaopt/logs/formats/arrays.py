@@ -91,9 +91,10 @@ def open_target_log(path: Path) -> Source:
     if rest:
         notes.append(f"its last row is cut off and left out: {rest} of {layout.itemsize} bytes are there")
     ticks = np.concatenate([[0], np.cumsum(np.diff(rows["tick"]).astype(np.int64))]) + int(rows["tick"][0])
-    columns = {"time": period * ticks, "lost": rows["lost"], "status": rows["status"]}
-    columns |= {name: rows[f"channel {k}"] for k, name in enumerate(names)}
-    stated = {"time": "s", "lost": "-", "status": "-"} | dict(zip(names, units, strict=True))
+    columns = {"time": period * ticks} | {name: rows[f"channel {k}"] for k, name in enumerate(names)}
+    if np.any(rows["status"]):  # one that is 0 throughout would look like a wire that is off
+        columns["status"] = rows["status"]
+    stated = dict(zip(names, units, strict=True)) | {"time": "s", "status": "-"}
     fields = tuple(
         Field(name=name, kind=values.dtype.name, length=count, unit=stated[name], clock="time")
         for name, values in columns.items()

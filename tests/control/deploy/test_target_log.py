@@ -163,7 +163,7 @@ def test_bad_files_are_told_from_each_other(whole, tmp_path):
     path.write_bytes(header + rows[:k] + rows[k + 3 * size :])
     table = so.read_log(path)
     assert len(table) == 197 and any("3 rows that the ring had are not in the file" in note for note in table.notes)
-    assert [field.name for field in contents(path).fields] == ["time", "lost", "status", *CLOSED]
+    assert [field.name for field in contents(path).fields] == ["time", *CLOSED]
 
 
 def test_accept_takes_the_file_as_it_is_and_names_another_law(whole, tuned, tmp_path):
