@@ -207,9 +207,10 @@ def _library() -> ctypes.CDLL:
     compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     if compiler is None:
         raise SystemExit("this benchmark simulates in C: install a C compiler")
-    target = Path(tempfile.mkdtemp(prefix="truth")) / "actuator.so"
-    subprocess.run([compiler, "-O2", "-std=c99", "-shared", "-fPIC", "-o", target, SOURCE, "-lm"], check=True)
-    return ctypes.CDLL(str(target))
+    with tempfile.TemporaryDirectory(prefix="truth") as folder:  # what is loaded needs its file no more
+        target = Path(folder) / "actuator.so"
+        subprocess.run([compiler, "-O2", "-std=c99", "-shared", "-fPIC", "-o", target, SOURCE, "-lm"], check=True)
+        return ctypes.CDLL(str(target))
 
 
 @cache
