@@ -92,7 +92,7 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
             for part in found.parts:
                 plant = so.plants.add_part(plant, part)
             params = plant.defaults.with_parameters(*params.values())
-            params = params.update(**found.parameters, **found.fixed).free(*found.frees)
+            params = params.update(**{**found.parameters, **found.fixed}).free(*found.frees)
             experiments = [replace(experiment, plant=plant) for experiment in experiments]
         elif better := find_better(fit):
             advice = f"from another {', '.join(better)}"
