@@ -46,7 +46,7 @@ Measured = str | tuple[str, ...]  # one output by its name, or several, the regu
 
 DELAY = "delay_s"
 DELAYS = (DELAY, DRIVE_DELAY)
-MAPPED = 512  # plants in one call of CasADi
+MAPPED = (1, 32, 128, 512)  # plants in one call of CasADi; what is left of a block is padded
 REACH, DEGREE = 0.125, 10  # of the exponential's Taylor polynomial: 0.125^11 / 11! = 3e-18
 NEWTON_STEPS = 30
 
@@ -381,8 +381,8 @@ def _map_columns(
 ) -> list[Float[np.ndarray, "_ _"]]:
     """Return a plant's CasADi function at every column, in blocks that CasADi maps over."""
     count = arguments[0].shape[1]
-    block = 1 if count == 1 else MAPPED
-    function = make(plant) if block == 1 else _block_function(plant, make)
+    block = next((size for size in MAPPED if size >= count), MAPPED[-1])
+    function = _block_function(plant, make, block)
     parts: list[list[Any]] = []
     for start in range(0, count, block):
         columns = [values[:, start : start + block] for values in arguments]
@@ -393,9 +393,9 @@ def _map_columns(
 
 
 @memo
-def _block_function(plant: Plant, make: Callable[[Plant], Any]) -> Any:
+def _block_function(plant: Plant, make: Callable[[Plant], Any], block: int) -> Any:
     """Return a plant's CasADi function, mapped over a block of columns."""
-    return make(plant).map(MAPPED)
+    return make(plant) if block == 1 else make(plant).map(block)
 
 
 @memo
