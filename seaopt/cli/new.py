@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -39,13 +39,14 @@ def write_problem(
     columns = parse_pairs("--channel", channels) | ({"time": time} if time is not None else {})
     look = partial(propose, columns=columns, units=parse_pairs("--unit", units))
     target = _choose_target(logs, output, force=force)
-    folder, answers = target.parent, dict[str, str]()
+    folder = target.parent
     console, errors = Terminal(stderr=json), Terminal(stderr=True)
     with show_progress(errors, "looking at the logs", errors.say, brief=True) as tell:
-        proposal = look(logs, answers, folder, target.stem, tell)
-    if not yes and not json:
-        proposal = _interview(console, answers, proposal, lambda: look(logs, answers, folder, target.stem))
-    _write_checked(target, proposal.text)
+        proposal = look(logs, {}, folder, target.stem, tell)
+    if yes or json:
+        _write_checked(target, proposal.text)
+    else:
+        proposal = _interview(console, target, proposal, lambda given: look(logs, given, folder, target.stem))
     if json:
         content = {
             "schema": "seaopt/new/1",
@@ -82,13 +83,16 @@ def _choose_target(logs: Sequence[Path], output: Path | None, *, force: bool) ->
     return target
 
 
-def _write_checked(target: Path, text: str) -> None:
-    """Write a problem file that the other commands take; where they would not, what was there stays."""
+def _write_checked(target: Path, text: str, *, keep: bool = True) -> None:
+    """Write a problem file that the other commands take, unless it is only checked; where they would not, what was
+    there stays.
+    """
     draft = target.with_name(f".seaopt-{secrets.token_hex(8)}.toml")
     try:
         write_text(draft, text)
         read_problem(draft)
-        draft.replace(target)
+        if keep:
+            draft.replace(target)
     except SeaoptError as error:
         raise ProblemError(str(error).replace(str(draft), str(target))) from error
     except OSError as error:
@@ -100,19 +104,44 @@ def _write_checked(target: Path, text: str) -> None:
 
 
 def _interview(
-    console: Terminal, answers: dict[str, str], proposal: Proposal, look: Callable[[], Proposal]
+    console: Terminal, target: Path, proposal: Proposal, look: Callable[[Mapping[str, str]], Proposal]
 ) -> Proposal:
-    """Ask question by question; an empty answer takes the guess, which stays marked as one unless it was a choice."""
-    done: set[str] = set()
-    while question := next((question for question in proposal.questions if question.key not in done), None):
-        done.add(question.key)
-        if question.key == "roles":
-            _print_columns(console, proposal)
-        answer = _ask(console, question)
-        if answer or question.choices:
-            answers[question.key] = answer or question.guess
-            proposal = look()
-    return proposal
+    """Ask question by question, and write the file; an empty answer takes the guess, which stays marked as one unless
+    it was a choice. An answer that the file is refused for is asked again.
+    """
+    done, answers = set[str](), dict[str, str]()
+    while True:
+        while question := next((question for question in proposal.questions if question.key not in done), None):
+            done.add(question.key)
+            if question.key == "roles":
+                _print_columns(console, proposal)
+            answer = _ask(console, question)
+            if answer or question.choices:
+                answers[question.key] = answer or question.guess
+                proposal = look(answers)
+        try:
+            _write_checked(target, proposal.text)
+            return proposal
+        except ProblemError as error:
+            wrong = next((key for key in reversed(answers) if _is_taken(target, look, answers, key)), None)
+            if wrong is None:
+                raise
+            console.say(f"  {error}", style="red")
+            done.remove(wrong)
+            answers.pop(wrong)
+            proposal = look(answers)
+
+
+def _is_taken(
+    target: Path, look: Callable[[Mapping[str, str]], Proposal], answers: Mapping[str, str], without: str
+) -> bool:
+    """Tell whether the other commands take the file with a guess in place of one of the answers."""
+    try:
+        text = look({key: answer for key, answer in answers.items() if key != without}).text
+        _write_checked(target, text, keep=False)
+    except SeaoptError:
+        return False
+    return True
 
 
 def _ask(console: Terminal, question: Question) -> str:
@@ -155,7 +184,7 @@ def _describe_guesses(proposal: Proposal) -> list[tuple[str, str, str]]:
     rows = {question.entry: (question.label, question.guess, question.why) for question in proposal.questions}
     for row in proposal.columns:
         rows[f"role of {row.column}"] = (f'Column "{row.column}"', row.role, row.doubt)
-    return [rows.get(name, (name.capitalize(), "", "see its line in the file")) for name in proposal.guessed]
+    return [rows.get(name, (name, "", "see its line in the file")) for name in proposal.guessed]
 
 
 def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:

@@ -342,6 +342,7 @@ def make_plant(
             stiffness=drive.stiffness,
             mass=second_order[0] if second_order else None,
             damping=second_order[1] if second_order else None,
+            damper=drive.spring_damping if actuator.damped_spring else None,
             play="g_b" if "backlash" in parts else None,
         ),
         ports=ports,

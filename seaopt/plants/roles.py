@@ -84,6 +84,7 @@ class SeriesSpring:
         default=None,
     )
     damping: str | None = option("Derived figure: its damping, read likewise.", default=None)
+    damper: str | None = option("Parameter that damps it, where one does.", default=None)
     play: str | None = option(
         "Parameter that is its play, where it has some; a fit that looks for it starts more than once.", default=None
     )

@@ -58,6 +58,15 @@ def test_answers_are_asked_for_until_they_count(folder, seaopt, held, answer):
     assert "guessed" in next(line for line in problem_lines(folder / "asked.toml") if line.startswith("k_s"))
 
 
+def test_an_answer_that_the_file_is_refused_for_is_asked_again(folder, seaopt, held, answer):
+    answer("", "", "100", "0.037", "250", "unknown", "20", "12", "9", "2000")
+    out = seaopt("new", "knee.csv", "-o", "asked.toml")
+    assert out.returncode == 0, out.stderr
+    assert "sample_rate_hz = 12 is too slow" in out.stdout and out.stdout.count("Rate at which") == 2
+    spec = so.read_problem(folder / "asked.toml").spec
+    assert (spec.sample_rate_hz, spec.current_limit_A, spec.bandwidth_hz) == (2000.0, 9.0, 20.0)
+
+
 def problem_lines(path):
     return path.read_text(encoding="utf-8").splitlines()
 

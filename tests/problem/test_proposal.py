@@ -305,7 +305,8 @@ def test_answers_take_the_place_of_guesses(tmp_path, logs):
     while missing := [one for one in propose([path], answers, tmp_path).questions if one.key not in answers]:
         answers |= {one.key: one.guess for one in missing}
     proposal = propose([path], answers, tmp_path)
-    assert not proposal.guesses and "guessed" not in proposal.text.split("schema")[1]
+    assert not proposal.guesses and proposal.guessed == ("c_s",)  # nobody is asked for it
+    assert "guessed: an undamped spring" in next(row for row in proposal.text.splitlines() if row.startswith("c_s "))
     problem = write(tmp_path, proposal.text)
     assert {name: problem.parameters[name].value for name in ("N", "K_tau", "k_s", "m")} == {
         "N": 80.0, "K_tau": 0.04, "k_s": 250.0, "m": 3.0,
@@ -321,13 +322,13 @@ def test_what_results_rest_on_and_nobody_knew_is_data(tmp_path, logs):
     problem = write(tmp_path, propose([path], {}, tmp_path).text)
     # K_tau is fitted, m is left out and the bandwidth is a wish: nothing rests on a guess of them.
     assert set(problem.table.guessed) == {
-        "unit of a", "unit of b", "unit of tau", "role of a", "role of b", "link of a.csv", "N", "k_s",
+        "unit of a", "unit of b", "unit of tau", "role of a", "role of b", "link of a.csv", "N", "k_s", "c_s",
         "sample_rate_hz", "current_limit_A",
     }  # fmt: skip
     known = {"roles": "yes", "unit:a": "s", "N": "100", "k_s": "unknown"}
     problem = write(tmp_path, propose([path], known, tmp_path).text)
     assert set(problem.table.guessed) == {
-        "unit of b", "unit of tau", "link of a.csv", "k_s", "sample_rate_hz", "current_limit_A",
+        "unit of b", "unit of tau", "link of a.csv", "k_s", "c_s", "sample_rate_hz", "current_limit_A",
     }  # fmt: skip
     assert next(line for line in propose([path], known, tmp_path).text.splitlines() if line.startswith("k_s ")).count(
         "guessed: cannot be identified from the log"

@@ -118,7 +118,12 @@ HYPOTHESES = (
         starts=lambda s: [{"g_b": share * s.deflection} for share in (0.01, 0.05) if s.deflection],
         fixed=lambda s: {"eps_b": 3e-5 * s.deflection},  # a rounder corner shows beside an encoder's noise
     ),
-    Hypothesis(effect="the spring is damped", part="spring_damping", starts=_zero("c_k")),
+    Hypothesis(
+        effect="the spring is damped",
+        part="spring_damping",
+        starts=_zero("c_k"),
+        usual=lambda stiffness: 1e-3 * stiffness,
+    ),
     Hypothesis(
         effect="the spring loses energy in each cycle",
         part="hysteresis",

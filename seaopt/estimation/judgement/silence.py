@@ -1,8 +1,9 @@
 r"""What no such log can tell: effects that other values of a fit's parameters make up for without a trace.
 
 A stand that gives is in series with the spring. A transmission that rubs more where it drives than where it is driven
-is one with another inertia, friction and efficiency. No residual shows either, so that each is looked for where it is
-not: its parameter :math:`\delta` joins the unknowns at its neutral value, zero, with the sensitivities of all of them,
+is one with another inertia, friction and efficiency. A damper across a spring whose other end is held is friction of
+the motor. No residual shows any of them, so that each is looked for where it is not: its parameter :math:`\delta` joins
+the unknowns at its neutral value, zero, or where it is fixed, with the sensitivities of all of them,
 
 .. math:: s^2 = H_{\delta\delta} - H_{\delta\theta} H_{\theta\theta}^{-1} H_{\theta\delta}, \qquad
           \frac{d\theta}{d\delta} = -H_{\theta\theta}^{-1} H_{\theta\delta} .
@@ -19,16 +20,15 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.errors import SeaoptError
-from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Hypothesis
+from seaopt.estimation.judgement.hypotheses import HYPOTHESES
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
 from seaopt.estimation.result.findings import SilentEffect
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.parameters import Parameter
-from seaopt.plants import Plant
+from seaopt.plants import Plant, add_part
 from seaopt.plants.memo import memo
-from seaopt.plants.parts import wrapped
 from seaopt.records import record
 
 SEEN = 5.0  # standard deviations by which an effect has to change the residual to be told
@@ -38,9 +38,10 @@ SOLVED = 1e-13
 
 @record(eq=False)
 class _Addition:
-    """A hypothesis that logs may not show, its parameter, and the experiments with it."""
+    """An effect that logs may not show, its part ("" where plants have it), its parameter, and experiments with it."""
 
-    hypothesis: Hypothesis
+    effect: str
+    part: str
     parameter: Parameter
     size: float
     experiments: dict[str, Experiment]
@@ -81,8 +82,8 @@ def _find_ties(fit: Fit, joint: FitProblem, evaluation: Evaluation, added: list[
         }
         if touched and size * np.sqrt(left) < SEEN:
             yield SilentEffect(
-                effect=addition.hypothesis.effect,
-                part=addition.hypothesis.part,
+                effect=addition.effect,
+                part=addition.part,
                 parameter=parameter.name,
                 unit=parameter.unit,
                 size=size,
@@ -92,34 +93,51 @@ def _find_ties(fit: Fit, joint: FitProblem, evaluation: Evaluation, added: list[
 
 
 def _add_each(fit: Fit) -> Iterator[_Addition]:
-    """Yield the hypotheses that logs may not show, on those experiments whose plants take them, one after the other."""
+    """Yield the hypotheses that logs may not show, on those experiments whose plants take them, one after the other;
+    and what plants have of it without a part, fixed.
+    """
     experiments = {experiment.name: experiment for experiment in fit.experiments}
     for hypothesis in HYPOTHESES:
         if hypothesis.usual is None:
             continue
         changed: dict[str, Experiment] = {}
+        names: set[str] = set()
         for name, experiment in experiments.items():
-            plant = _add(experiment.plant, hypothesis.part)
-            if plant is not None:
+            plant, damper = experiment.plant, experiment.plant.spring and experiment.plant.spring.damper
+            if hypothesis.part == "spring_damping" and damper:
+                if damper not in experiment.parameters:
+                    changed[name] = experiment
+                    names.add(damper)
+            elif (plant := _add(plant, hypothesis.part)) is not None:
                 changed[name] = replace(experiment, plant=plant)
-        if not changed:
+                names |= plant.parameters.keys() - experiment.plant.parameters.keys()
+        if len(names) != 1:
             continue
+        (name,) = names
         first = next(iter(changed.values()))
-        (name,) = first.plant.parameters.keys() - experiments[first.name].plant.parameters.keys()
         parameter, spring = first.plant.parameters[name], first.plant.spring
-        if name in fit.parameters or not isinstance(parameter, Parameter) or spring is None or not spring.stiffness:
+        is_there = name in experiments[first.name].plant.parameters
+        if is_there:
+            parameter = fit.parameters[name]
+        elif name in fit.parameters:
+            continue
+        if not isinstance(parameter, Parameter) or parameter.free or spring is None or not spring.stiffness:
             continue
         stiffness = first.plant.complete(first.apply_own(fit.parameters))[spring.stiffness].value
         experiments |= changed
         yield _Addition(
-            hypothesis=hypothesis, parameter=parameter, size=hypothesis.usual(stiffness), experiments=changed
+            effect=hypothesis.effect + (" more" if parameter.value else ""),
+            part="" if is_there else hypothesis.part,
+            parameter=parameter,
+            size=hypothesis.usual(stiffness),
+            experiments=changed,
         )
 
 
 @memo
 def _add(plant: Plant, part: str) -> Plant | None:
-    """Return a plant with a part around it; None where it does not take it."""
+    """Return a plant with a part; None where it does not take it."""
     try:
-        return wrapped(plant, (part,))
+        return add_part(plant, part)
     except SeaoptError:
         return None

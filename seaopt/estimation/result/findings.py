@@ -53,9 +53,9 @@ class SilentEffect:
     effect : str
         In words.
     part, parameter, unit : str
-        What would bring it, and the parameter that is its size.
+        What would bring it ("" where the plant has it), and the parameter that is its size.
     size : float
-        One that actuators have.
+        One that actuators have; where the parameter is there, how much more.
     shifts : mapping of name to float
         By how much each parameter that it touches would be more, per unit of it, in SI.
     seen : float

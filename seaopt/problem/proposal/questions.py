@@ -78,7 +78,7 @@ class Interview:
     def __init__(self, answers: Mapping[str, str]) -> None:
         self.answers = dict(answers)
         self.questions: list[Question] = []
-        self.assumed: list[str] = []
+        self.assumed: dict[str, str] = {}  # why, by key
 
     def ask(
         self,
@@ -108,10 +108,9 @@ class Interview:
         answer = self.ask(key, text, UNKNOWN, why, open=True, usual=usual)
         return None if answer == UNKNOWN else float(answer)
 
-    def assume(self, key: str) -> None:
+    def assume(self, key: str, why: str = "") -> None:
         """Note a guess that no answer replaces: nobody was asked, or nobody knew."""
-        if key not in self.assumed:
-            self.assumed.append(key)
+        self.assumed.setdefault(key, why)
 
     def mark(self, *keys: str) -> str:
         """Return what of these answers is a guess, as the end of a comment; what is left to the fit is none."""
@@ -120,7 +119,7 @@ class Interview:
             for question in self.questions
             if question.key in keys
             and (question.key in self.assumed or (question.key not in self.answers and question.guess != UNKNOWN))
-        ]
+        ] or [why for key, why in self.assumed.items() if key in keys and why]
         return f"guessed: {'; '.join(reasons)}" if reasons else ""
 
     def list_doubts(self) -> dict[str, str]:

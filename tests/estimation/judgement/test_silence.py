@@ -16,9 +16,10 @@ SCREW = {"m_l": 0.646, "k": 655e3, "l": 0.002, "N_p": 3.0, "K_tau": 0.0255, "J":
          "v_s": 2e-3}  # fmt: skip
 
 
-def record(*, linear=False, give=0.0, driving=0.0, driven=0.0):
+def record(*, linear=False, give=0.0, driving=0.0, driven=0.0, damping=0.0):
     """Return the log of a motor on a held spring, in series with a stand that gives by a share of the spring; friction
-    grows by shares of the spring's effort, where the motor drives it and where it drives the motor.
+    grows by shares of the spring's effort, where the motor drives it and where it drives the motor. `damping` is a
+    damper's across a gear's spring.
     """
     p = SCREW if linear else ROTARY
     t, current = drive(6.0, RATE_HZ, 2.5, seed=1, top_hz=25.0)
@@ -32,11 +33,12 @@ def record(*, linear=False, give=0.0, driving=0.0, driven=0.0):
         effort = stiffness * place / ratio**2
         level = p["f_c"] + 0.5 * (driving + driven) * abs(effort)
         rub = level * math.tanh(speed / p["v_s"]) + p["b_r"] / lead**2 * speed
+        rub += damping / ratio**2 * speed
         rub += 0.5 * (driving - driven) * effort  # where it slides: more against the spring than with it
         return speed, (p["K_tau"] / lead * ampere - rub - effort) / inertia
 
     place, speed = integrate(rates, 2, current, 1.0 / RATE_HZ, 4)
-    noise, effort = np.random.default_rng(2), stiffness * place / ratio
+    noise, effort = np.random.default_rng(2), (stiffness * place + damping * speed) / ratio
     if linear:
         pushed = np.array([rates(x, u)[1] for x, u in zip(zip(place, speed, strict=True), current, strict=True)])
         readings = {"F1": (effort, 1.0), "F2": (effort + p["m_l"] * pushed, 1.0), "q": (place, 1e-7)}
@@ -46,10 +48,10 @@ def record(*, linear=False, give=0.0, driving=0.0, driven=0.0):
     return so.Log.from_arrays(time=t, I=current, **noisy)
 
 
-def fit(log, *, linear=False, parts=(), free=None):
+def fit(log, *, linear=False, parts=(), free=None, **given):
     plant = so.plants.high_impedance(parts=parts) if linear else so.plants.rotary(link="locked", parts=parts)
     names = free or (("J", "b_r", "f_c", "k", "eta") if linear else ("J_m", "b_r", "f_c", "k_s", "eta"))
-    params = plant.defaults.update(**(SCREW if linear else ROTARY)).free(*names)
+    params = plant.defaults.update(**(SCREW if linear else ROTARY), **given).free(*names)
     params = params.update(c_e=0.03).free("c_e") if parts else params
     outputs = tuple(name for name in log.signals if name != "I")
     return so.fit([so.Experiment(plant=plant, log=log, outputs=outputs, initial_state="rest")], params)
@@ -87,6 +89,25 @@ def test_back_driving_is_said_to_touch_all_that_scales_with_it(linear):
     for name, value in values.items():
         expected = {"eta": 1.0, "c_e": 0.08}.get(name) or truth[name]
         assert value == pytest.approx(expected, rel=0.01), name
+
+
+def test_a_fixed_damping_of_the_spring_is_said_to_touch_the_motors():
+    """With the other end held a damper c across the spring is c/N^2 at the motor: angles do not tell which it is."""
+    damper = 0.4
+    log = record(damping=damper)
+    angle = so.Log.from_arrays(time=log.time, I=log["I"], theta_m=log["theta_m"])
+    names = ("J_m", "b_r", "f_c")
+    result = fit(angle, free=names)
+    assert result.met
+    values = follow(result, "", damper)
+    assert result.parameters["b_r"].value == pytest.approx(ROTARY["b_r"] + damper / ROTARY["N"] ** 2, rel=2e-3)
+    assert values.keys() == {"b_r"}
+    assert values["b_r"] == pytest.approx(ROTARY["b_r"], rel=3e-3)
+    assert "told from such a log: b_r where the spring is damped" in " ".join(repr(result).split())
+    right = fit(angle, free=names, c_s=damper)
+    assert right.met
+    assert right.parameters["b_r"].value == pytest.approx(ROTARY["b_r"], rel=3e-3)
+    assert "b_r where the spring is damped more" in " ".join(repr(right).split())
 
 
 def test_what_a_log_does_tell_is_not_named():

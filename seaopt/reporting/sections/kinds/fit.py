@@ -105,10 +105,10 @@ def _say_silent(fit: Fit) -> Iterator[str]:
             unit = "" if parameter.value else unit_after(parameter.unit)
             moves.setdefault(f"{of_value}{unit} {'more' if shift * each.size > 0.0 else 'less'}", []).append(name)
         would = " and ".join(f"{join_words(names)} would be {by}" for by, names in moves.items())
-        yield (
-            f"Such logs cannot tell whether {each.effect}: with {each.parameter} = {each.size:.3g}"
-            f"{unit_after(each.unit)} (part {each.part}) {would}, and the outputs the same."
-        )
+        size = f"{each.size:.3g}{unit_after(each.unit)}"
+        added = f"= {size} (part {each.part})" if each.part else f"{size} more"
+        what = f"whether {each.effect}: with {each.parameter} {added} {would}"
+        yield f"Such logs cannot tell {what}, and the outputs the same."
 
 
 def _tabulate_parameters(fit: Fit) -> Table:
