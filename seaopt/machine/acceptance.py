@@ -12,6 +12,7 @@ from seaopt.codec import to_content
 from seaopt.control import Controller, ForceMPC, ScheduledController, draw, runnable
 from seaopt.control.deploy.target import hash_law
 from seaopt.control.laws.delay import find_drive
+from seaopt.control.loops.sampled_plant import conditions
 from seaopt.errors import LogError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import join_words
@@ -126,7 +127,7 @@ def accept(
     uncertainty : Fit or ParameterSet, optional
         What the controller was certified for, with `ranges`: draws of it say how far a machine may be from the model.
     ranges : mapping of str to (low, high), optional
-        As in `certify`.
+        As in `certify`, of what the design plant has.
     confidence : float
         Of each statement on the response.
 
@@ -289,9 +290,9 @@ def list_draws(
 
 
 def take_ranges(controller: Controller, ranges: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    """Return the ranges of what the design plant has, of those of all plants."""
+    """Return the ranges of what the design plant has, of those of all plants whose values a set may hold."""
     if controller.design is None:
         return {}
     plant, values = controller.design
-    names = {**plant.complete(values), **values}
+    names = {*plant.parameters, *(conditions((plant,)).keys() & values.keys())}
     return {name: ends for name, ends in ranges.items() if name in names}

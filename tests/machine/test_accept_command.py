@@ -18,7 +18,9 @@ from tests.machine.test_response import LINES
 PROBLEM = """
 schema = 1
 title = "Stand"
-plant = { stand = { kind = "high_impedance" } }
+parameters = { I_p = { value = 0.36, unit = "kg m^2" } }  # of the other plant alone
+plant = { stand = { kind = "high_impedance" }, swing = { kind = "moving_output" } }
+robustness = { plants = ["swing"], parameters = { I_p = [0.2, 0.6] } }
 controller = { plant = "stand", measured = "F1", bandwidth_hz = 30, max_sensitivity = 1.6, current_limit_A = 9.0 }
 """
 
