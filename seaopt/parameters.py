@@ -182,7 +182,10 @@ class ParameterSet(Mapping[str, Parameter]):
         try:
             return self._items[name]
         except KeyError:
-            raise ParameterError(f'parameter "{name}" is not in this set; {suggestion(name, self._items)}') from None
+            raise ParameterError(
+                f'parameter "{name}" is not in this set; {suggestion(name, self._items)}; one without a default is '
+                f'added: with_parameters(so.Parameter(name="{name}", value=..., unit="..."))'
+            ) from None
 
     def __contains__(self, name: object) -> bool:
         return name in self._items

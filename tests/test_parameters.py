@@ -59,6 +59,7 @@ def test_a_set_is_a_mapping_for_unknown_names_too(thor):
     with pytest.raises(KeyError) as caught:
         thor["nope"]
     assert str(caught.value).startswith('parameter "nope" is not in this set')
+    assert 'with_parameters(so.Parameter(name="nope", value=..., unit="..."))' in str(caught.value)
 
 
 def test_a_wrong_unit_names_its_parameter():

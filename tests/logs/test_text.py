@@ -219,3 +219,15 @@ def test_columns_named_like_a_time_and_columns_that_wrap():
     assert [is_time_name(name) for name in ("Zeit [ms]", "imu.t", "F1 [N]")] == [True, True, False]
     assert suspect_wrap(np.array([0.0, 3.0, 65530.0, 65535.0, 1.0]), 0.0, 65535.0) == 16
     assert spell_column(column="cur", unit="A") == 'column = "cur", unit = "A"'
+
+
+def test_a_time_whose_name_ends_in_its_unit_is_the_time(file):
+    log = read_log(file("time_ms,a [A]\n0,1\n2.5,2\n5,3\n"), channels={"a": "a [A]"})
+    assert log.time == pytest.approx(TIME)
+
+
+def test_a_last_line_that_is_cut_is_said_to_be_unfinished(file):
+    with pytest.raises(LogError, match=r"line 4: .*the last line is unfinished; remove it"):
+        read_log(file("t [s],a [A]\n0,1\n1,2\n2,-"), channels={"a": "a [A]"})
+    with pytest.raises(LogError, match=r"line 3: .* is not a number; correct it"):
+        read_log(file("t [s],a [A]\n0,1\n1,-\n2,3\n"), channels={"a": "a [A]"})

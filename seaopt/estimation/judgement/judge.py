@@ -33,6 +33,7 @@ from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.widening import widen
+from seaopt.formatting import join_words
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore
@@ -44,6 +45,8 @@ OF_HYPOTHESES, OF_CAUSES = 3, 2  # times those, that refits of hypotheses and of
 TESTS, CAUSES = 1.0, 3.0  # of the time of a judgement that tries causes
 HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
 WORSE = -1.0  # fit percent below which a constant explains more, beyond rounding and an offset that is fixed
+ALIKE = 0.95  # of an output's energy, that a multiple of the model explains where only sign or unit are wrong
+TURNED = 0.1  # by which the factor may differ from 1 or -1
 RUNS_AWAY = -1e3  # fit percent below which a free run is ten times as large as what was measured
 LITTLE = 0.02  # of an output's energy: where no model explains more, explaining less is no fault
 CHANCE = 1e-6  # probability below which a test is not chance
@@ -257,11 +260,7 @@ def _find_unexplained(
         share, explained, explainable = shares.get(where), fitted.explained, fitted.explainable
         percents = (fitted.fit_percent, fitted.band_fit_percent, fitted.one_step_fit_percent)
         if explained is not None and max(percent for percent in percents if percent is not None) < WORSE:
-            text = (
-                "the model explains it worse than a constant: another plant, sign or unit, or jumps such as a counter "
-                "that wraps"
-            )
-            yield _warn("explained", where, text, bad=True)
+            yield _warn("explained", where, _explain_worse(fit, where), bad=True)
             continue
         if explained is None or explainable is None or share is None:
             continue
@@ -281,6 +280,25 @@ def _find_unexplained(
                 f"{follows:.2g} times its sensor's noise: the model lacks something"
             )
             yield _warn("residual", where, text, bad=bad)
+
+
+def _explain_worse(fit: Fit, where: str) -> str:
+    """Return why a constant explains an output better: by a regression of it on the model's, its sign or unit."""
+    name, output = where.rsplit(".", 1)
+    run = fit.predict(next(each for each in fit.experiments if each.name == name))
+    there = np.isfinite(run.measured[output]) & np.isfinite(run.model[output])
+    measured, model = (each[output][there] - each[output][there].mean() for each in (run.measured, run.model))
+    both, energy = float(measured @ model), float(model @ model)
+    gain = both / energy if energy else 0.0
+    worse = "the model explains it worse than a constant"
+    if not gain or abs(gain - 1.0) < TURNED or gain * both < ALIKE * float(measured @ measured):
+        return f"{worse}: another plant, sign or unit, or jumps such as a counter that wraps"
+    scale = -1.0 if abs(gain + 1.0) < TURNED else 1.0 / gain
+    what = join_words([*(["sign"] if gain < 0.0 else []), *(["unit or scale"] if scale != -1.0 else [])])
+    return (
+        f"{worse}, and {scale:.4g} times it well: the log has another {what} of it (or of the input, where every "
+        f'output is so); write {output} = {{ column = "...", scale = {scale:.4g} }}, or multiply the scale it has'
+    )
 
 
 def _find_held_out(fit: Fit) -> Iterator[FitFinding]:

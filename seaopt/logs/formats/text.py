@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 BLOCK_BYTES = 4 << 20
 BLOCKS_AHEAD = 2  # blocks that are parsed while the next one is read and the last one is stored
 _RUNS = re.compile(rb"[ \t]+")
+_BEGUN = re.compile(r"[-+]|[-+]?[\d.,]+[eE][-+]?")  # a number that is cut
 _BLANK_LINES = re.compile(rb"(?m)^[ \t]*\r?\n")
 
 
@@ -218,7 +219,8 @@ def _parse_frame(layout: TextLayout, block: bytes, columns: Collection[int], kin
 
 def _cell_error(layout: TextLayout, block: bytes, number: int, index: Mapping[str, int], reason: str) -> LogError:
     """Return the error that names the first cell, or row, that cannot be read."""
-    for line, text in enumerate(block.decode().split("\n"), start=_find_first_line(layout, number)):
+    lines = block.decode().rstrip().split("\n")
+    for line, text in enumerate(lines, start=_find_first_line(layout, number)):
         row = split_cells(text.rstrip("\r"), layout.delimiter) if text.strip() else []
         if len(row) > layout.width:
             return LogError(
@@ -231,6 +233,8 @@ def _cell_error(layout: TextLayout, block: bytes, number: int, index: Mapping[st
                 continue
             where = f'{layout.path}: line {line}: "{cell[:60]}" in column "{name}"'
             if not is_number(cell, layout.comma):
+                if text is lines[-1] and at == len(row) - 1 and _BEGUN.fullmatch(cell):
+                    return LogError(f"{where} is not a number: the last line is unfinished; remove it")
                 points = ", or save the log with decimal points" if re.fullmatch(r"[-+]?\d+,\d+", cell) else ""
                 return LogError(f"{where} is not a number; correct it{points}")
             if "inf" in cell.casefold():

@@ -75,7 +75,7 @@ def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Ite
     for kind, rows, what in (
         ("time_missing", clock.not_numbers, "no number as time; remove these rows"),
         ("backwards", clock.backwards, "a time before that of the row ahead; sort the rows, or cut the log there"),
-        ("duplicate", clock.repeated, "the time of the row ahead; keep one row of each"),
+        ("duplicate", clock.repeated, 'the time of the row ahead; keep one row of each: duplicates = "first"'),
     ):
         if rows.size:
             text = f"{format_count(rows.size, 'row')} of {clock.samples} with {what}"

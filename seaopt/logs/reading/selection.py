@@ -22,6 +22,7 @@ from seaopt.signals import check_distinct
 from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
+_TIME_ENDING = re.compile(r"_(s|ms|us|ns)$")
 MAX_NAMES = 20  # in a message
 HOW_TO_ALIGN = "align it by Hold(), Linear() or Nearest(tolerance_s=...)"
 ALIGNED = ({"align": {"hold": {}}}, {"align": {"linear": {}}})  # the same as keys
@@ -330,6 +331,16 @@ def _find_time_column(source: Source) -> Column:
     names = [field.name for field in source.fields if field.numeric]
     lengths = {field.name: field.length for field in source.fields}
     named = [field for field in source.fields if field.numeric and is_time_name(field.header or field.name)]
+    if not named:
+        endings = {
+            field.name: _TIME_ENDING.search(field.name) for field in source.fields if field.numeric and not field.unit
+        }
+        stated = {
+            name: ending[1] for name, ending in endings.items() if ending and is_time_name(name[: ending.start()])
+        }
+        if len(stated) == 1:
+            ((name, unit),) = stated.items()
+            return Column(column=name, unit=unit)
     # T in degrees is a temperature; of several, one with another unit is no time.
     times = [
         field.name

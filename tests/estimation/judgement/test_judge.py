@@ -14,7 +14,7 @@ import seaopt as so
 from seaopt.estimation.judgement.candidates import find_clipping
 from seaopt.estimation.judgement.causes import find_causes
 from seaopt.estimation.judgement.coherence import measure_coherence
-from seaopt.estimation.judgement.judge import _find_unexplained
+from seaopt.estimation.judgement.judge import _conclude, _find_unexplained
 
 RATE_HZ = 400.0
 K, M_L, J, B_R, K_TAU, RADIUS = 655e3, 0.646, 3.31e-6, 1.31e-4, 0.0255, 0.002 / (2 * math.pi * 3.0)
@@ -208,6 +208,23 @@ def test_an_output_that_a_constant_explains_better_is_an_error():
     told = replace(result, outputs={"log": result.outputs["log"] | {"F2": worse}})
     findings = list(_find_unexplained(told, {}, {"log.F1": 1.0, "log.F2": 1.0}))
     assert [(one.severity, one.kind, one.where) for one in findings] == [("error", "explained", "log.F2")]
+
+
+@pytest.mark.parametrize(("factor", "said"), [(-1.0, "another sign of it"), (1000.0, "another unit or scale of it")])
+def test_an_output_of_another_sign_or_unit_is_named_once_with_the_line_to_write(factor, said):
+    result, columns = fit(bench()), bench()
+    log = so.Log.from_arrays(time=np.arange(4000) / RATE_HZ, **columns | {"F2": factor * columns["F2"]})
+    worse = replace(result.outputs["log"]["F2"], fit_percent=-100.0, explained=0.0, explainable=0.0)
+    spoilt = replace(
+        result,
+        outputs={"log": result.outputs["log"] | {"F2": worse}},
+        experiments=(replace(result.experiments[0], log=log),),
+    )
+    (finding,) = _find_unexplained(spoilt, {}, {"log.F1": 1.0, "log.F2": 1.0})
+    scale = re.search(r"F2 = .*scale = (\S+) }", finding.text)
+    assert said in finding.text and scale and float(scale[1]) == pytest.approx(1.0 / factor, rel=0.01)
+    words = " ".join(repr(_conclude(replace(spoilt, findings=(finding,)))).split())
+    assert words.count("worse than a constant") == 1
 
 
 def test_a_small_misfit_that_follows_the_input_far_above_the_noise_is_an_error():

@@ -33,7 +33,7 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
         return Verdict(met=True, text=f"Fit: converged, {size}{outputs}{_name_silent(fit)}")
     status = "" if fit.status == "converged" else f"{fit.status.replace('_', ' ')}, "
     errors = [(each.text, each.where) for each in fit.errors]
-    if fit.status != "converged" and not any(fit.message in text for text, _ in errors):
+    if fit.status != "converged" and not _repeats(fit):
         errors.insert(0, (fit.message, ""))
     reasons, cures = tuple(_group(errors)), "; or ".join(_list_cures(fit))
     again = f"correct the file, then type {commands.fit}" if commands.fit else ""
@@ -81,12 +81,18 @@ def describe(fit: Fit) -> list[Section]:
 
 
 def _list_caveats(fit: Fit) -> Iterator[str]:
-    yield f"{fit.message[:1].upper()}{fit.message[1:]}."
+    if not _repeats(fit):
+        yield f"{fit.message[:1].upper()}{fit.message[1:]}."
     if fit.caveat:
         yield f"{fit.caveat[:1].upper()}{fit.caveat[1:]}."
     for direction in fit.identifiability.unidentifiable:
         yield f"Not identifiable: {' + '.join(f'{weight:.2g} {name}' for name, weight in direction.items())}."
     yield from _say_silent(fit)
+
+
+def _repeats(fit: Fit) -> bool:
+    """Tell whether a fit's message says what one of its errors says, which the verdict has."""
+    return any(fit.message in each.text or f"{each.where}: {each.text}" in fit.message for each in fit.errors)
 
 
 def _name_silent(fit: Fit) -> str:
