@@ -24,7 +24,9 @@ MUCH_FINER = 4.0  # times: a change of the step whose error is not taken on trus
 NEARBY = 10.0  # standard deviations, over which a step error does not change
 # Of an order: where a joint that sticks stops, residuals jump, and finer steps make that no better for ever.
 MOST_STEPS = {4: MAX_SUBSTEPS, 2: 32}
-MOST_STEPS_BY_EVENTS = 16  # between events order four needs no more, and what turns or stops by chance gains nothing
+# Between events order four needs no more, and what turns or stops by chance gains nothing; twice that where a sharp
+# corner, such as that of play, leaves more than is tolerated.
+MOST_STEPS_BY_EVENTS = 16
 STIFF, STIFFER = 8.0, 4.0  # stable steps per sample that a search may always take, and times those at its start
 SAME_COST = 1e-2  # relative change of a cost, with steps of half the length, that bristles at the start may make
 EXACT = 1e-6  # noise below this part of an output's spread asks no more of the integrator
@@ -193,7 +195,9 @@ def _choose_steps(steps: int, error: StepError, allowed: float, experiment: FitE
     if over <= 1.0 or not np.isfinite(over):
         return steps
     model = experiment.model
-    order, most = model.order, MOST_STEPS_BY_EVENTS if model.by_events else MOST_STEPS[model.order]
+    order, most = model.order, MOST_STEPS[model.order]
+    if model.by_events:
+        most = MOST_STEPS_BY_EVENTS if over <= TOLERATED else 2 * MOST_STEPS_BY_EVENTS
     finer = steps * min(1.1 * over ** (1.0 / order), MUCH_FINER)
     return min(max(int(np.ceil(finer)), steps + 1), max(most, steps))
 

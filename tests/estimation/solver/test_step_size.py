@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.estimation.solver.step_size import check_steps
+from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.solver.step_size import STEP_ERROR_SIGMA, StepError, _choose_steps, check_steps
 
 
 def test_a_step_error_is_measured_again_where_derivatives_are_not_finite(swing, thor):
@@ -39,3 +41,10 @@ def test_a_search_that_ends_early_states_its_iterations_once(stand, thor, iterat
     assert fit.status == "max_iterations" and fit.iterations == iterations
     assert f"{iterations} iterations" in repr(fit) and f"{iterations} iterations" not in fit.message
     assert "start closer" in fit.message
+
+
+@pytest.mark.parametrize(("error", "steps"), [(0.02, 16), (0.2, 32)])
+def test_sharp_corners_between_events_take_more_steps_only_where_the_error_is_not_tolerated(error, steps):
+    experiment = create_autospec(FitExperiment, instance=True)
+    experiment.model.by_events, experiment.model.order = True, 4
+    assert _choose_steps(16, StepError(output=error), STEP_ERROR_SIGMA, experiment) == steps
