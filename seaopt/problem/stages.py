@@ -46,6 +46,7 @@ from seaopt.errors import ControlError, ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.estimation.result.findings import find_guesses, order_findings
 from seaopt.files import parse_file
+from seaopt.formatting import join_words
 from seaopt.frequency import MeasuredResponse
 from seaopt.logs import Log
 from seaopt.parameters import Parameter, ParameterSet
@@ -315,8 +316,8 @@ def _derates(problem: Problem, controller: Controller | ForceMPC) -> bool:
 def complete_schedule(
     problem: Problem, schedule: ScheduledController, source: Fit | ParameterSet
 ) -> ScheduledController:
-    """Return a schedule with the problem's guards, the gate that of the point where the plant moves the furthest, and
-    with what it compensates.
+    """Return a schedule with the problem's guards, the gate's step that of the point where the plant moves the
+    furthest, and with what it compensates.
     """
     values = problem.values(source)
     link = (
@@ -326,11 +327,33 @@ def complete_schedule(
     between = ((schedule.at(value), place(value)) for value in list_inner(schedule.points, PARTS))
     laws = _add_impedance(problem, list(zip(schedule.controllers, map(place, schedule.points), strict=True)), between)
     guarded = [_guard(problem, controller, source) for controller in laws]
-    gates = [controller.gate for controller in guarded if controller.gate is not None]
-    widest = max(gates, key=lambda gate: gate.max_step_N, default=None)
-    guarded = replace(schedule, controllers=tuple(replace(each, gate=widest) for each in guarded))
+    gate = _join_gates(problem, schedule, [controller.gate for controller in guarded if controller.gate is not None])
+    guarded = replace(schedule, controllers=tuple(replace(each, gate=gate) for each in guarded))
     terms = _list_terms(problem, values)
     return compensate_schedule(guarded, **terms) if terms else guarded
+
+
+def _join_gates(
+    problem: Problem, schedule: ScheduledController, gates: Sequence[PlausibilityGate]
+) -> PlausibilityGate | None:
+    """Return the gate of all points: with the widest step and agreement, where the encoders say the same at each."""
+    if not gates:
+        return None
+    widest = max(gates, key=lambda gate: gate.max_step_N)
+    agreements = [gate.agreement for gate in gates if gate.agreement is not None]
+    if not agreements:
+        return widest
+    first = agreements[0]
+    for value, each in zip(schedule.points, agreements, strict=True):
+        if not np.allclose(each.weights, first.weights, rtol=1e-9, atol=0.0):
+            raise ProblemError(
+                f"{problem.source}: controller.gate: agreement: what {join_words(first.reads)} say of the force "
+                f"differs over {schedule.over} (weights {first.weights} at {schedule.points[0]:g}, {each.weights} at "
+                f"{value:g}), and a schedule has one gate; leave agreement out, or schedule over what the spring does "
+                "not depend on"
+            )
+    limit, share = (max(getattr(each, name) for each in agreements) for name in ("limit", "share"))
+    return replace(widest, agreement=replace(first, limit=limit, share=share))
 
 
 def _make_gate(

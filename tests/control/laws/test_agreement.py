@@ -12,6 +12,7 @@ import seaopt as so
 from seaopt.control import MPCSpec, PlausibilityGate, force_mpc, runnable
 from seaopt.control.laws.plausibility import FALSE_ALARMS, SIGMAS, Agreement
 from seaopt.errors import ControlError
+from seaopt.problem import tune_problem
 from seaopt.problem.stages import complete_controller, fit_problem
 from tests.c_code import CompiledLaw
 
@@ -192,3 +193,33 @@ def test_the_noise_is_that_of_a_log_that_has_both(tmp_path, tuned):
         k = fit.parameters["k"]
         assert found.share == pytest.approx(SIGMAS * k.total_std / k.value, rel=1e-6)
         assert found.limit == pytest.approx(SIGMAS * np.hypot(SIGMA, K * SIGMA_Q), rel=0.1)
+
+
+@pytest.mark.parametrize(("over", "points"), [("J", (3e-6, 4e-6)), ("k", (5e5, 8e5))])
+def test_a_schedule_has_one_agreement_or_is_refused(over, points, tmp_path):
+    """It took the weights of the widest gate, and true readings at another stiffness were a fault."""
+    file = tmp_path / "agreeing.toml"
+    text = PROBLEM.format(outputs='["F1", "q"]').replace(
+        "_hz = 30", f'_hz = 25\nschedule = {{ over = "{over}", points = {list(points)} }}'
+    )
+    file.write_text(text + "[robustness.sensors]\nnoise_std = { F1 = 2.0, q = 1e-6 }\n", encoding="utf-8")
+    problem = so.read_problem(file)
+    values = problem.parameters.update(eta=1.0)
+    if over == "k":
+        with pytest.raises(
+            so.SeaoptError, match=r"gate: agreement: what q say of the force differs over k .* leave agr"
+        ):
+            tune_problem(problem, values)
+        return
+    schedule = tune_problem(problem, values)
+    steps = [
+        PlausibilityGate.of_controller(replace(each, gate=None), range_N=(-4e3, 4e3)).max_step_N
+        for each in schedule.controllers
+    ]
+    assert {each.gate.max_step_N for each in schedule.controllers} == {max(steps)} and steps[0] != steps[1]
+    law = schedule.runnable()
+    for value in np.linspace(*points, 3):
+        state = law.reset(place=value)
+        for _ in range(20):
+            _, state = law.step(state, 600.0, 600.0, value, [600.0 / K])
+        assert state.status == "ok"
