@@ -15,6 +15,7 @@ has to move, see `causes`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -81,14 +82,12 @@ def run_score_tests(
 
 
 def _test(value: float, unit: str, score: float, information: float, variance: float, count: int) -> ScoreTest:
-    from scipy.special import erfc  # deferred: scipy is slow to load
-
     chi2 = float(score**2 / variance)
     return ScoreTest(
         value=value,
         unit=unit,
         chi2=chi2,
-        p=min(count * float(erfc(np.sqrt(0.5 * chi2))), 1.0),
+        p=min(count * math.erfc(math.sqrt(0.5 * chi2)), 1.0),
         preferred=float(value - score / information),
         fall=0.5 * float(score**2 / information),
     )

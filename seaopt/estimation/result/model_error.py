@@ -305,10 +305,13 @@ def find_effort(experiment: Experiment) -> int:
 
 def _measure_envelope(values: Signal, period: float) -> Signal:
     """Return the largest distance from the median within 0.25 s; NaN where samples are missing."""
-    from scipy.ndimage import maximum_filter1d  # deferred: scipy is slow to load
-
     away = np.abs(values - np.nanmedian(values)) if np.any(np.isfinite(values)) else np.zeros_like(values)
-    return maximum_filter1d(np.nan_to_num(away), max(1, round(ENVELOPE_S / period)))
+    width, length = max(1, round(ENVELOPE_S / period)), 1
+    largest = np.pad(np.nan_to_num(away), (width // 2, width - 1 - width // 2))
+    while length < width:  # the largest of ever longer stretches from each sample on
+        step = min(length, width - length)
+        largest, length = np.maximum(largest[:-step], largest[step:]), length + step
+    return largest
 
 
 def _measure_speed(experiment: FitExperiment, model: Float[np.ndarray, "n ny"]) -> Signal:

@@ -125,10 +125,10 @@ def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) ->
             return problem, evaluation, checks
         trusted = all(new < MUCH_FINER * old for new, old in zip(finer, substeps, strict=True))
         problem = _with_substeps(problem, finer)
-        # Where the error was looked at steps of half the length have been made, and where those do are kept.
-        there = problem.evaluate(evaluation.passes.z if problem.straight else evaluation.z)
-        straight = problem.straight and np.isfinite(there.cost)
-        evaluation = problem.follow(there, evaluation.z) if straight else there
+        # Where the error was looked at steps of half the length have been made; offsets follow from there.
+        made, curved = evaluation.passes.z, ~problem.unknowns.linear
+        followed = problem.exactly_linear and np.array_equal(made[curved], evaluation.z[curved])
+        evaluation = problem.evaluate(made if followed else evaluation.z)
         if trusted:
             return problem, evaluation, checks
 
