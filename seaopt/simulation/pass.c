@@ -223,8 +223,9 @@ INLINE void smooth_step(hot *q, double t, const line *in, const double *c, doubl
         memcpy(z, q->z, sizeof z);
         memcpy(sum, q->z, sizeof sum);
     }
-    for (int stage = 0; stage < 4; stage++) {
-        const double part = reach[stage] * h;
+    const int stages = h == 0.0 ? 1 : 4; /* all are the first in a step of no length, which its delay alone moves */
+    for (int stage = 0; stage < stages; stage++) {
+        const double part = reach[stage] * h, share = stages == 1 ? 1.0 : weight[stage];
         for (int i = 0; stage && i < NX; i++) {
             x[i] = x0[i] + part * f[i];
             for (int j = 0; DERIVED(wide) && j < wide; j++) ((vec *)z[i])[j] = ((vec *)q->z[i])[j] + part * ((vec *)k[i])[j];
@@ -236,9 +237,9 @@ INLINE void smooth_step(hot *q, double t, const line *in, const double *c, doubl
         }
         slope(q, t + part, x, u, du, c, (const double (*)[NJP])z, mode, f, k, wide);
         for (int i = 0; i < NX; i++) {
-            x1[i] += weight[stage] * h * f[i];
-            for (int j = 0; DERIVED(wide) && j < wide; j++) ((vec *)sum[i])[j] += weight[stage] * h * ((vec *)k[i])[j];
-            if (DERIVED(wide) && DELAYED) sum[i][1 + NQ] += weight[stage] * dh * f[i];
+            x1[i] += share * h * f[i];
+            for (int j = 0; DERIVED(wide) && j < wide; j++) ((vec *)sum[i])[j] += share * h * ((vec *)k[i])[j];
+            if (DERIVED(wide) && DELAYED) sum[i][1 + NQ] += share * dh * f[i];
         }
     }
     for (int i = 0; i < NX; i++) {

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter1d
 from scipy.signal import lfilter
 
 import seaopt as so
 from seaopt.estimation import Huber, Squares
-from seaopt.estimation.result.model_error import INDEPENDENT, PARTS, estimate_model_error
+from seaopt.estimation.result.model_error import ENVELOPE_S, INDEPENDENT, PARTS, _measure_envelope, estimate_model_error
 from seaopt.estimation.result.widening import widen
 
 N, PERIOD = 16_000, 1e-3
@@ -171,3 +172,12 @@ def test_intervals_hold_over_hundreds_of_logs():
     shares = cover(200)
     assert shares["noise"] >= 0.93
     assert shares["missing"] >= 0.95
+
+
+@pytest.mark.parametrize("width", [1, 2, 5, 64, 100, 251])
+def test_the_envelope_is_scipys_filter(width):
+    values = np.random.default_rng(1).normal(size=200)
+    values[20:30] = np.nan
+    away = np.nan_to_num(np.abs(values - np.nanmedian(values)))
+    envelope = _measure_envelope(values, ENVELOPE_S / width)
+    np.testing.assert_array_equal(envelope, maximum_filter1d(away, width))
