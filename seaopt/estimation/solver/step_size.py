@@ -125,10 +125,12 @@ def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) ->
             return problem, evaluation, checks
         trusted = all(new < MUCH_FINER * old for new, old in zip(finer, substeps, strict=True))
         problem = _with_substeps(problem, finer)
-        # Where the error was looked at steps of half the length have been made; offsets follow from there.
+        # Where the error was looked at steps of half the length have been made; offsets follow from there. Where joints
+        # stick a search goes another way by as little as rounding.
         made, curved = evaluation.passes.z, ~problem.unknowns.linear
         followed = problem.exactly_linear and np.array_equal(made[curved], evaluation.z[curved])
-        evaluation = problem.evaluate(made if followed else evaluation.z)
+        sticks = any(experiment.model.sticks for experiment in problem.experiments)
+        evaluation = problem.evaluate(made if followed and not sticks else evaluation.z)
         if trusted:
             return problem, evaluation, checks
 
