@@ -133,9 +133,12 @@ class Agreement:
     def __post_init__(self) -> None:
         if len(self.weights) != len(self.reads):
             raise ControlError("should have a weight of each encoder")
-        for value in (self.limit, *map(abs, self.weights)):
+        for name, value in (("limit", self.limit), *(("weights", abs(weight)) for weight in self.weights)):
             if not 1.0 / LARGEST < value < LARGEST:
-                raise ControlError(f"limit and weights should be between {1.0 / LARGEST:g} and {LARGEST:g}")
+                raise ControlError(
+                    f"agreement: {name} of {value:g} should be between {1.0 / LARGEST:g} and {LARGEST:g}; give the "
+                    "sensors their noise, and the spring its stiffness"
+                )
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -200,21 +203,29 @@ class Agreement:
                 f"agreement: the noise of {join_words(missing)} is not known; it takes a log with {regulated} and "
                 f"{join_words(names)}, or their noise_std in [robustness.sensors]"
             )
+        for name in (regulated, *names):
+            if not 0.0 <= require_number(noise[name], f"agreement: noise of {name}", ControlError) < math.inf:
+                raise ControlError(f"agreement: noise of {name} = {noise[name]:g} is no std; give a finite one")
         weights, lag = _weigh(plant, params, regulated, names)
         share, latest = 0.0, abs(lag)
         for parameter in _list_uncertain(plant, params, (regulated, *names)):
             std = parameter.prior_std if parameter.total_std is None else parameter.total_std
             if not (std and math.isfinite(std)):
                 raise ControlError(f"agreement: {parameter.name} is not known; fit it, or give it a prior_std")
-            moved = replace(parameter, value=parameter.value + SIGMAS * std, min=-math.inf, max=math.inf)
-            others, late = _weigh(plant, params.with_parameters(moved), regulated, names)
-            part = float(others @ weights / (weights @ weights)) - 1.0
-            if np.max(np.abs(others - (1.0 + part) * weights)) > 1e-6 * np.max(np.abs(weights)):
-                raise ControlError(
-                    f"agreement: {parameter.name} has a std, and changes what one encoder says against the other; give "
-                    "its value"
-                )
-            share, latest = share + abs(part), latest + abs(late - lag)
+            parts, late = [0.0], [0.0]
+            least = getattr(plant.parameters[parameter.name], "min", -math.inf) + 1e-6 * abs(parameter.value)
+            for end in (max(parameter.value - SIGMAS * std, least), parameter.value + SIGMAS * std):
+                moved = replace(parameter, value=end, min=-math.inf, max=math.inf)
+                others, lead = _weigh(plant, params.with_parameters(moved), regulated, names)
+                part = float(others @ weights / (weights @ weights)) - 1.0
+                if np.max(np.abs(others - (1.0 + part) * weights)) > 1e-6 * np.max(np.abs(weights)):
+                    raise ControlError(
+                        f"agreement: {parameter.name} has a std, and changes what one encoder says against the other; "
+                        "give its value"
+                    )
+                parts.append(abs(part))
+                late.append(abs(lead - lag))
+            share, latest = share + max(parts), latest + max(late)
         if share >= MOST_SHARE:
             raise ControlError(
                 f"agreement: the std of the spring is {100.0 * share / SIGMAS:.2g} % of it, with which hardly anything "

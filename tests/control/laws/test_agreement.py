@@ -40,10 +40,18 @@ def test_the_threshold_is_five_point_seven_sigma_and_what_the_spring_is_not_know
     k, n = values["k_s"].value, values["N"].value
     np.testing.assert_allclose(found.weights, [k / n, -k], rtol=1e-9)
     share = SIGMAS * 2.0 / k
-    lag = 0.3 / k + abs(0.3 / (k + SIGMAS * 2.0) - 0.3 / k) + SIGMAS * 0.02 / k
+    lag = 0.3 / (k - SIGMAS * 2.0) + SIGMAS * 0.02 / k
     sigma = np.hypot(0.05, (1 + share) * k * np.hypot(2e-3 / n, 1e-4))
     assert found.share == pytest.approx(share, rel=1e-9)
     assert found.limit == pytest.approx(SIGMAS * sigma + 0.1 + 40.0 * lag, rel=1e-9)
+
+
+def test_the_share_is_that_of_the_end_that_needs_more():
+    """Of a ratio the weight is k/N: its lower end moves it further than its upper one."""
+    knee = so.plants.rotary(link="locked")
+    values = knee.defaults.prior(N=0.05 * knee.defaults["N"].value)
+    found = Agreement.of_plant(knee, values, "tau_s", dict.fromkeys(("tau_s", "theta_m", "theta_l"), 1e-3))
+    assert found.share == pytest.approx(1.0 / (1.0 - 0.05 * SIGMAS) - 1.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("off", [-SIGMAS, 0.0, SIGMAS])
@@ -142,6 +150,15 @@ def test_what_cannot_be_compared_is_refused(check, stand, thor, tuned):
     ):
         with pytest.raises(ControlError, match=f"agreement: .*{told}"):
             Agreement.of_plant(plant, values or plant.defaults, regulated, noise)
+    for std, told in (
+        (0.0, "limit of 0 should be between .*; give the sensors their noise"),
+        (-2.0, "noise of F1 = -2 is no std; give a finite one"),
+        (np.nan, "noise of F1 = nan is no std"),
+        (np.inf, "noise of F1 = inf is no std"),
+        ("2", "noise of F1 = '2' is a str; give a real number"),
+    ):
+        with pytest.raises(ControlError, match=f"agreement: {told}"):
+            Agreement.of_plant(stand, thor, "F1", {"F1": std, "q": 0.0})
     with pytest.raises(ControlError, match=r"the noise of q is not known; it takes a log with F1 and q, or"):
         PlausibilityGate.of_controller(tuned, range_N=(-4000.0, 4000.0), agreement=True, noise={"F1": 2.0})
     mpc = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0))
