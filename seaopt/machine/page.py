@@ -64,6 +64,8 @@ def say_cause(cause: Cause) -> str:
             return f"the compensation of {cause.what} is missing"
         case "part":
             return f"the {cause.what} is missing"
+        case "rounding":
+            return f"undecided: rounding of the log allows {value} (rms) of the command; log it with more digits"
         case "another law":
             return f"it is the law of {cause.what}"
         case _:
@@ -140,7 +142,7 @@ def _show_interval(row: Judged) -> str:
 
 def _say_mismatch(row: Replay, result: Acceptance) -> str:
     unit = unit_after(result.controller.command.unit)
-    if row.causes and row.causes[0].explains:
+    if row.undecided or (row.causes and row.causes[0].explains):
         return say_cause(row.causes[0])
     off = f"the command is off by {format_number(row.mismatch, 3)}{unit} (rms), of {format_number(row.rms, 3)}{unit}"
     if not row.causes:
@@ -231,7 +233,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     rows = tuple(
         (
             Path(source).name,
-            mark_met(row.met),
+            Mark(text="undecided", style="warning") if row.undecided else mark_met(row.met),
             str(row.ticks),
             *(format_number(value, 3) for value in (row.mismatch, row.largest, row.allowed, row.rms)),
             f"{100.0 * row.saturated:.2g} %",
@@ -262,7 +264,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     for source, row in zip(result.sources, result.replays, strict=True):
         table = tuple(
             (say_cause(cause), f"{100.0 * cause.removes:.4g} %", mark_met(cause.explains, "all", "in part"))
-            for cause in row.causes[:MOST_CAUSES]
+            for cause in row.causes[: 0 if row.undecided else MOST_CAUSES]
         )
         if table:
             table = Table(head=("if", "removes", "explains"), rows=table, align="<><")

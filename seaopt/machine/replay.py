@@ -6,7 +6,8 @@ to the commands is :math:`C A^k x_0`, which is linear in it.
 
 **What rounding allows.** The logged command is off by up to half its step. A reading that is logged coarser than the
 law saw it, by a step :math:`q`, adds an error of variance :math:`\frac{q^2}{12} \sum_{j \le k} h_j^2` at row k, with
-the law's impulse response h: it grows with the integral.
+the law's impulse response h: it grows with the integral. Levels of a reference of steps are no rounding;
+where rounding allows more than a tenth of the command, nothing is decided.
 
 **Causes.** Where the replay does not match, each of a list of causes is tried: the law or the log is changed by it, and
 replayed. Factors are found by least squares of the logged commands over what reference and readings add to them. They
@@ -40,25 +41,17 @@ SIGMAS = 4.0  # of what rounding allows
 HEAD, LEAST_HEAD = 400, 60  # rows that tell the state at the first, and rows within the limit that factors take
 HEAD_DECAYS, LONGEST_HEAD = 3.0, 20000  # time constants of the slowest part that they last besides, and rows at most
 INTEGRATES = 1e-6  # distance from 1 of a pole that does not decay
+COARSEST = 0.1  # of the command's rms, that rounding may allow of a replay that decides
+LEVELS = 200  # of a reference that is taken for rounded; what has fewer is steps
 LONGEST_RESPONSE = 5000  # rows over which an error of rounding is added up
 WINDOW = 2000  # rows on which causes are tried, about the largest mismatch
 EVERY = (2, 3, 4, 5, 10)  # rows per tick of a law that is slower than the logger
-UNITS = (
-    1e-3,
-    1e3,
-    60.0 / (2.0 * math.pi),
-    2.0 * math.pi / 60.0,
-    180.0 / math.pi,
-    math.pi / 180.0,
-    1e-6,
-    1e6,
-    1e2,
-    1e-2,
-)
+UNITS = tuple(each**power for each in (1e3, 60.0 / (2.0 * math.pi), 180.0 / math.pi, 1e6, 1e2) for power in (-1, 1))
 SAME_RATE = 0.02  # relative: of the log's clock and the law's
 SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
 MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
 MOST_CAUSES = 6
+UNDECIDED = ("rounding",)  # causes that lie in the log, for which it decides nothing
 
 
 @record
@@ -90,6 +83,11 @@ class Replay:
     law_rate_hz: float
     ticks_per_row: int = 1  # of a log that has every n-th tick: it was compared line by line
     causes: tuple[Cause, ...] = ()
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the log cannot tell this law from another."""
+        return bool(self.causes) and self.causes[0].kind in UNDECIDED
 
 
 @record(eq=False)
@@ -141,6 +139,9 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
     rate_hz, law_rate_hz = ticks.rate_hz, 1.0 / whole.controller.sample_time_s
     if match.met and abs(rate_hz / law_rate_hz - 1.0) > SAME_RATE:
         causes = (Cause(kind="rate", what="clock", value=rate_hz, unit="Hz", removes=1.0, explains=True),)
+    allowed, rms = math.sqrt(float(np.mean(match.allowed**2))), float(np.std(ticks.command))
+    if match.met and not causes and allowed > COARSEST * rms:
+        causes = (Cause(kind="rounding", what="log", value=allowed, unit="", removes=0.0, explains=False),)
     met = match.met and not causes
     limit = whole.linear.command_limit
     off = np.flatnonzero(np.abs(match.error) > SIGMAS * match.allowed)
@@ -149,8 +150,8 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
         ticks=len(ticks),
         mismatch=math.sqrt(match.energy),
         largest=float(np.max(np.abs(match.error))),
-        allowed=math.sqrt(float(np.mean(match.allowed**2))),
-        rms=float(np.std(ticks.command)),
+        allowed=allowed,
+        rms=rms,
         off_from=None if match.met or not off.size else int(off[0]),
         saturated=find_saturated(ticks, limit),
         command_late=late,
@@ -302,7 +303,9 @@ def _allow(law: RunnableLaw, ticks: Ticks) -> Float[np.ndarray, " n"]:
     """Return one std of what rounding allows at each row."""
     n = len(ticks)
     response = _find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
-    steps = [(law.b_reference, law.d_reference, ticks.reference)]
+    steps: list[Any] = []
+    if np.unique(ticks.reference).size >= LEVELS:
+        steps.append((law.b_reference, law.d_reference, ticks.reference))
     columns = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
     steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i]) for i in range(law.measured)]
     variance = np.full(n, ticks.quantum**2 / 12.0 + (FLOOR * float(np.std(ticks.command))) ** 2)

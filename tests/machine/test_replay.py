@@ -61,6 +61,26 @@ def test_a_fault_of_the_firmware_has_its_name(controller, bench, changes, expect
     assert (cause.kind, cause.what) == expected[:2] and np.isclose(cause.value, expected[2], rtol=1e-6)
 
 
+STEPS = 100.0 * ((np.arange(3000) // 500) % 4)
+
+
+@pytest.mark.parametrize("reference", [STEPS, 100.0 * np.sign(np.sin(0.02 * np.arange(3000)))])
+def test_levels_of_a_reference_are_no_rounding_under_which_any_command_passes(controller, bench, reference):
+    log = bench.log(Machine(), reference)
+    (row,) = so.accept(controller, [log]).replays
+    assert row.met and row.allowed < 0.01 * row.rms
+    for factor in (0.5, -1.0, 0.0):
+        assert not so.accept(controller, [rename(log, I=factor * log["I"])]).replayed
+
+
+def test_a_log_whose_rounding_allows_much_of_the_command_is_undecided(controller, bench):
+    log = bench.log(Machine(), STEPS)
+    result = so.accept(controller, [rename(log, F1=50.0 * np.round(log["F1"] / 50.0))])
+    (row,) = result.replays
+    assert not row.met and row.allowed > 0.1 * row.rms and [cause.kind for cause in row.causes] == ["rounding"]
+    assert "more digits" in str(result)
+
+
 def test_a_law_that_is_stepped_at_another_rate_is_told_by_the_clock(controller, bench):
     cause = cause_of(controller, bench.log(Machine(), REFERENCE, period=2e-3))
     assert (cause.kind, cause.what) == ("rate", "clock") and np.isclose(cause.value, 500.0)
