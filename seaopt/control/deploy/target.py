@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
+
+import numpy as np
 
 from seaopt.codec import to_content
 from seaopt.control.deploy.c_text import identifier, strip_markup
@@ -62,8 +64,18 @@ def hash_law(law: RunnableLaw | RunnableSchedule, outer: OuterLoop | None = None
     if isinstance(law, RunnableSchedule):
         table = law.table
         numbers |= {"table": [table.structure, table.over, table.points, dict(table.columns)]}
-    content = plain(to_content({"outer": outer, "heated": law.heat is not None, **numbers}))
+    heat = () if law.heat is None else law.heat.numbers
+    wound = np.ravel(law.anti_windup)
+    scale = np.max(np.abs(wound), initial=0.0)
+    shares = np.round(wound / (scale or 1.0), 9) + 0.0  # of the largest, for those that only rounding keeps from zero
+    numbers |= {"heat": _round(heat), "anti_windup": [*_round([scale]), *shares.tolist()]}
+    content = plain(to_content({"outer": outer, **numbers}))
     return digest_plain(json.loads(json.dumps(content), parse_int=float))[:16]  # 9 and 9.0 are one limit
+
+
+def _round(values: Iterable[float]) -> list[float]:
+    """Return numbers that are computed again, to the digits in which they then agree."""
+    return [float(f"{value:.9g}") for value in values]
 
 
 def describe_log(

@@ -10,10 +10,11 @@ import pytest
 import seaopt as so
 from seaopt.codec import from_content
 from seaopt.control.deploy.export import export, read_guard
+from seaopt.control.deploy.target import hash_law
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError, FileError
-from seaopt.files import plain
+from seaopt.files import plain, to_json
 from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import STRICT
 
@@ -170,6 +171,12 @@ def test_the_file_has_what_the_code_needs(controller, tmp_path):
     content["heat"]["guard"]["b_1"] = None
     with pytest.raises(FileError, match="b_1"):
         export(content, tmp_path / "c", derate=True)
+
+
+def test_the_hash_from_memory_is_that_from_the_file(controller):
+    again = so.Controller.from_dict(json.loads(to_json(controller.to_dict())), *controller.design)
+    derated = hash_law(runnable(controller, heat=controller.heat_guard))
+    assert hash_law(runnable(again, heat=again.heat_guard)) == derated != hash_law(runnable(controller))
 
 
 def test_what_cannot_be_derated_is_one_line(controller, tmp_path):

@@ -17,9 +17,11 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.errors import ControlError, LogError
 from seaopt.files import to_json
 from seaopt.logs import contents
+from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import CompiledLog
 from tests.schedules import tune_knee
 
+HOT = {"a_11": 0.985, "a_12": 0.01, "a_21": 0.001, "a_22": 0.9989, "b_1": 0.02, "b_2": 1e-5}
 CLOSED = "reference", "F1", "I"
 
 
@@ -185,13 +187,22 @@ def test_the_hash_is_of_what_the_law_does(tuned, stand, thor):
     assert hash_law(runnable(again)) == own and len(own) == 16
     agreement = Agreement(reads=("q",), weights=(655e3,), limit=12.0, share=0.02)
     gate = PlausibilityGate(range_N=(-9e3, 9e3), max_step_N=9e3, max_held=5, ramp_A_per_s=90.0, agreement=agreement)
+    law = runnable(tuned)
+    heat = HeatGuard(**HOT, resistance=0.6, slope=0.002, allowed_rise=80.0, share=0.02, ambient=21.0)
     others = [
+        replace(law, anti_windup=1.001 * law.anti_windup, tracking_time_s=law.tracking_time_s / 1.001),
+        replace(law, heat=heat),
+        replace(law, heat=replace(heat, share=0.03)),
+        replace(law, heat=replace(heat, resistance=heat.resistance * 1.01)),
+        replace(law, heat=replace(heat, allowed_rise=heat.allowed_rise - 1.0)),
         runnable(tuned, command_limit=8.0),
         runnable(tuned, gate=gate),
         runnable(tuned, gate=replace(gate, agreement=None)),
         replace(runnable(tuned), c=runnable(tuned).c * (1.0 + 1e-15)),
     ]
-    assert len({own, *map(hash_law, others)}) == 5
+    assert len({own, *map(hash_law, others)}) == 10
+    nearly = replace(law, anti_windup=law.anti_windup * (1.0 + 1e-15), heat=replace(heat, b_1=heat.b_1 * (1.0 + 1e-15)))
+    assert hash_law(nearly) == hash_law(replace(law, heat=heat))  # as it is computed again from a file
 
 
 def test_encoders_and_their_units_are_channels(compiler, tuned, tmp_path):
