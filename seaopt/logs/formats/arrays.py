@@ -19,6 +19,7 @@ from seaopt.signals import TARGET_LOG
 
 HEADS = [("tick", "<u4"), ("lost", "<u2"), ("status", "<u2")]  # of a row of the target
 LOST_FOR_MORE, WORST_STATUS = 65535, 2
+FARTHEST = 255  # ticks from one row to the next, beyond those that the rows tell, in most rows of a log
 LONGEST_HEADER = 1 << 16
 RECORD_AGAIN = "record it again, draining whole rows from one context"
 
@@ -81,26 +82,48 @@ def open_target_log(path: Path) -> Source:
         raise LogError(
             f"{path}: its header is cut off or damaged; a log begins with NAME_log_header as it is in the C"
         ) from error
-    size = path.stat().st_size - len(line)
-    count, rest = divmod(size, layout.itemsize)
-    if not count:
-        raise LogError(f"{path}: has a header and no whole row of {layout.itemsize} bytes; drain the ring into it")
-    check_size(path, size, "the log")
-    rows = np.fromfile(path, dtype=layout, offset=len(line), count=count)
-    notes = _check_rows(path, rows, len(line), layout.itemsize)
-    if rest:
-        notes.append(f"its last row is cut off and left out: {rest} of {layout.itemsize} bytes are there")
+    try:
+        rows, notes = _read_rows(path, layout, len(line))
+    except LogError as error:
+        rows, notes = _read_behind_zero(path, layout, len(line), error)
     ticks = np.concatenate([[0], np.cumsum(np.diff(rows["tick"]).astype(np.int64))]) + int(rows["tick"][0])
     columns = {"time": period * ticks} | {name: rows[f"channel {k}"] for k, name in enumerate(names)}
     if np.any(rows["status"]):  # one that is 0 throughout would look like a wire that is off
         columns["status"] = rows["status"]
     stated = dict(zip(names, units, strict=True)) | {"time": "s", "status": "-"}
     fields = tuple(
-        Field(name=name, kind=values.dtype.name, length=count, unit=stated[name], clock="time")
+        Field(name=name, kind=values.dtype.name, length=len(rows), unit=stated[name], clock="time")
         for name, values in columns.items()
     )
     load = make_row_loader(lambda name, where: columns[name][where])
     return Source(path=path, format="a log of the target", fields=fields, load=load, notes=tuple(notes), law=law)
+
+
+def _read_rows(path: Path, layout: np.dtype[Any], first: int) -> tuple[Any, list[str]]:
+    """Return the rows from a byte on, and what is to be said of them."""
+    size = path.stat().st_size - first
+    count, rest = divmod(size, layout.itemsize)
+    if count < 1:
+        raise LogError(f"{path}: has a header and no whole row of {layout.itemsize} bytes; drain the ring into it")
+    check_size(path, size, "the log")
+    rows = np.fromfile(path, dtype=layout, offset=first, count=count)
+    notes = _check_rows(path, rows, first, layout.itemsize)
+    if rest:
+        notes.append(f"its last row is cut off and left out: {rest} of {layout.itemsize} bytes are there")
+    return rows, notes
+
+
+def _read_behind_zero(path: Path, layout: np.dtype[Any], first: int, error: LogError) -> tuple[Any, list[str]]:
+    """Return the rows behind a header that was written with the zero at its end. Raises `error`: it was not."""
+    with path.open("rb") as stream:
+        stream.seek(first)
+        if stream.read(1) != b"\0":
+            raise error
+    try:
+        rows, notes = _read_rows(path, layout, first + 1)
+    except LogError:
+        raise error from None
+    return rows, [*notes, "the zero behind its header is left out; write NAME_LOG_HEADER_BYTES bytes of the header"]
 
 
 def _check_rows(path: Path, rows: Any, first: int, size: int) -> list[str]:
@@ -113,6 +136,13 @@ def _check_rows(path: Path, rows: Any, first: int, size: int) -> list[str]:
         raise LogError(
             f"{path}: row {k} (byte {first + k * size}) does not follow the one before: bytes are missing, or two logs "
             f"are in one file; {RECORD_AGAIN}"
+        )
+    far = np.flatnonzero((steps > FARTHEST + lost) & (lost < LOST_FOR_MORE))
+    if 2 * far.size > steps.size:  # as of ticks that are read a byte or more too early
+        k = int(far[0]) + 1
+        raise LogError(
+            f"{path}: row {k} (byte {first + k * size}) is {steps[k - 1]} ticks after the one before, and most are far "
+            f"from theirs: bytes are missing, or too many, between header and rows; {RECORD_AGAIN}"
         )
     notes: list[str] = []
     full, gone = lost > 0, (steps > 1 + lost) & (lost < LOST_FOR_MORE)

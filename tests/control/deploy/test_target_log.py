@@ -168,6 +168,30 @@ def test_bad_files_are_told_from_each_other(whole, tmp_path):
     assert [field.name for field in contents(path).fields] == ["time", *CLOSED]
 
 
+def test_rows_that_are_shifted_are_not_read_as_a_log(whole, tmp_path):
+    """By a byte too many every tick is 256 after the one before: it was read, with rows that the ring had missing."""
+    header, rows, _ = whole
+    path = tmp_path / "run.sealog"
+    for extra in (b"\7", b"\7\7", b"\0\0", b"\7\7\7", rows[-3:]):
+        path.write_bytes(header + extra + rows)
+        with pytest.raises(
+            LogError, match=r"row 1 \(byte \d+\) is \d+ ticks after .* missing, or too many, between hea"
+        ):
+            so.read_log(path)
+    for lost in (1, 2, 3):
+        path.write_bytes(header + rows[lost:])
+        with pytest.raises(LogError, match=r"row 1 \(byte \d+\) does not follow"):
+            so.read_log(path)
+    path.write_bytes(header + rows)
+    wanted = so.read_log(path)
+    for cut, told in ((0, 1), (5, 2)):  # as fwrite(header, sizeof header) writes it
+        path.write_bytes(header + b"\0" + rows[: len(rows) - cut])
+        table = so.read_log(path)
+        np.testing.assert_array_equal(table["F1"], wanted["F1"][: len(table)])
+        assert len(table) == 200 - bool(cut) and len(table.notes) - len(wanted.notes) == told
+        assert any("the zero behind its header is left out" in note for note in table.notes)
+
+
 def test_accept_takes_the_file_as_it_is_and_names_another_law(whole, tuned, tmp_path):
     path = tmp_path / "run.sealog"
     path.write_bytes(whole[0] + whole[1])
