@@ -118,6 +118,14 @@ def test_no_row_is_torn_between_two_threads(compiler, tuned, tmp_path):
     assert torn == 0 and rows + overruns == ticks and rows >= 5_000 and overruns
 
 
+def test_a_core_that_reads_a_count_in_pieces_is_refused(compiler, tuned, tmp_path):
+    export(tuned, tmp_path, name="law", log_rows=16)
+    (tmp_path / "limits.h").write_text("#define UINT_MAX 65535U\n")  # of 16 bit
+    command = [*compiler, f"-I{tmp_path}", "-c", tmp_path / "law_log.c", "-o", tmp_path / "law_log.o"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode and "log on one of 32 bit or more" in done.stderr
+
+
 def test_a_tick_goes_on_after_two_to_the_32(compiler, tuned, tmp_path):
     log = CompiledLog(compiler, tmp_path, tuned, 64)
     log.ring[3] = 2**32 - 5
