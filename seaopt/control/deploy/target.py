@@ -12,7 +12,7 @@ import numpy as np
 
 from seaopt.codec import to_content
 from seaopt.control.deploy.c_text import identifier, strip_markup
-from seaopt.control.laws.plausibility import FALSE_ALARMS, SIGMAS
+from seaopt.control.laws.plausibility import FALSE_ALARMS, LARGEST, SIGMAS
 from seaopt.control.laws.realisation import RunnableLaw
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
@@ -25,7 +25,7 @@ LOG_TEMPLATES = {"{}_log.h": "log.h.jinja", "{}_log.c": "log.c.jinja"}
 TARE_TEMPLATES = {"{}_tare.h": "tare.h.jinja", "{}_tare.c": "tare.c.jinja"}
 LOG_ROWS, MOST_ROWS = 512, 1 << 20
 WIDTH = 80  # of a piece of the header in C
-FEWEST_TARED = 100
+FEWEST_TARED, MOST_TARED = 100, 1 << 30
 DERIVED = {"anti_windup", "tracking_time_s", "heat"}  # computed again where a controller.json is read, to rounding
 
 
@@ -45,7 +45,7 @@ class Tare:
     Raises
     ------
     ControlError
-        A number is not positive.
+        A number is not positive, or beyond what a target's numbers hold.
     """
 
     noise: float
@@ -54,8 +54,12 @@ class Tare:
 
     def __post_init__(self) -> None:
         for name in ("noise", "limit", "duration_s"):
-            if not 0.0 < require_number(getattr(self, name), name, ControlError) < math.inf:
-                raise ControlError(f"tare: {name} = {getattr(self, name):g} is not positive; give a positive number")
+            value = require_number(getattr(self, name), f"tare: {name}", ControlError)
+            if not 1.0 / LARGEST < value < LARGEST:  # whose squares a target's `float` holds, too
+                raise ControlError(
+                    f"tare: {name} = {value:g} is not positive, between {1.0 / LARGEST:g} and {LARGEST:g}; give such a "
+                    "number"
+                )
 
 
 def hash_law(law: RunnableLaw | RunnableSchedule, outer: OuterLoop | None = None) -> str:
@@ -90,7 +94,8 @@ def describe_log(
     """Return what the templates of a log have in words and numbers. `context`: of the law's; `names`: of what it reads,
     the regulated one first; `units`: of these, as far as they are known.
     """
-    if isinstance(rows, bool) or not 2 <= rows <= MOST_ROWS or rows & (rows - 1):
+    whole: Any = rows
+    if isinstance(whole, bool) or not isinstance(whole, int) or not 2 <= rows <= MOST_ROWS or rows & (rows - 1):
         raise ControlError(f"log_rows = {rows!r} is not a power of two from 2 to {MOST_ROWS}; give such as {LOG_ROWS}")
     suffix, width = context["suffix"], 8 if context["precision"] == "double" else 4
     first, *more = names
@@ -122,11 +127,15 @@ def describe_log(
 
 
 def describe_tare(tare: Tare, sample_time_s: float) -> dict[str, Any]:
-    """Return the numbers of a tare as text. Raises ControlError: it is too short."""
+    """Return the numbers of a tare as text. Raises ControlError: it is too short or too long."""
     count = 2 * round(0.5 * tare.duration_s / sample_time_s)
     if count < FEWEST_TARED:
         raise ControlError(
             f"tare: duration_s = {tare.duration_s:g} is {count} samples; average {FEWEST_TARED} at least"
+        )
+    if count > MOST_TARED:
+        raise ControlError(
+            f"tare: duration_s = {tare.duration_s:g} is {count:g} samples; give {MOST_TARED * sample_time_s:g} at most"
         )
     of_mean = SIGMAS * tare.noise / math.sqrt(count)
     slack = 2.0 / (9.0 * (count - 1))  # the end of chi squared, by Wilson and Hilferty

@@ -107,5 +107,10 @@ def test_numbers_out_of_range_are_refused(tuned, tmp_path):
     for name in ("noise", "limit", "duration_s"):
         with pytest.raises(ControlError, match=f"tare: {name} = 0 is not positive"):
             Tare(**{"noise": NOISE, "limit": LIMIT, "duration_s": 1.0, name: 0.0})
+        for value in (1e-320, np.nan):
+            with pytest.raises(ControlError, match=f"tare: {name} = {value:g} is not positive, between 1e-15 and 1e"):
+                Tare(**{"noise": NOISE, "limit": LIMIT, "duration_s": 1.0, name: value})
+    with pytest.raises(ControlError, match=r"duration_s = 1e\+14 is 1e\+17 samples; give 1.07374e\+06 at most"):
+        export(tuned, tmp_path, tare=Tare(noise=NOISE, limit=LIMIT, duration_s=1e14))
     with pytest.raises(ControlError, match=r"duration_s = 0\.05 is 50 samples; average 100 at least"):
         export(tuned, tmp_path, tare=Tare(noise=NOISE, limit=LIMIT, duration_s=0.05))
