@@ -6,6 +6,7 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -22,15 +23,19 @@ KEPT_BYTES = 1 << 26  # of the passes that are kept at a time
 
 
 class _Kept:
-    """The last passes, as many as there is room for, with the models and segments that their keys name by identity."""
+    """The last passes, as many as there is room for, with the models and segments that their keys name by identity.
+
+    Threads of a fit share it.
+    """
 
     def __init__(self) -> None:
         self._passes: dict[Any, tuple[Pass, Model, Segment]] = {}
         self._bytes = 0
+        self._lock = Lock()
 
     def find(self, key: Any, rows: int, *, columns: bool) -> Pass | None:
         """Return a pass that has the outputs of so many samples, and columns if wanted."""
-        result = self._passes[key][0] if key in self._passes else None
+        result, *_ = self._passes.get(key, (None,))
         if result is None or (rows and (result.outputs is None or len(result.outputs) < rows)):
             return None
         return None if columns and result.columns is None else result
@@ -40,11 +45,12 @@ class _Kept:
         for array in (result.outputs, result.columns):
             if array is not None:
                 array.flags.writeable = False
-        self._drop(key)
-        self._passes[key] = result, model, segment
-        self._bytes += _measure_bytes(result)
-        while self._bytes > KEPT_BYTES:
-            self._drop(next(iter(self._passes)))
+        with self._lock:
+            self._drop(key)
+            self._passes[key] = result, model, segment
+            self._bytes += _measure_bytes(result)
+            while self._bytes > KEPT_BYTES:
+                self._drop(next(iter(self._passes)))
 
     def _drop(self, key: Any) -> None:
         if key in self._passes:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +25,7 @@ from seaopt.simulation import (
     interpreted,
     layout_of,
     make_model,
+    run,
     run_passes,
     stream,
 )
@@ -383,3 +387,24 @@ def test_other_unknowns_of_a_linear_plant_need_no_other_code(stand, thor):
 def test_too_many_filter_sections_are_refused():
     with pytest.raises(SimulationError, match="9 filter sections"):
         Weights(sections=np.zeros((9, 5)), settle=0, knee=np.ones(1))
+
+
+def test_threads_share_the_passes_that_are_kept(monkeypatch):
+    """Each adds and drops: the oldest was looked for while another thread changed what there is."""
+    monkeypatch.setattr(run, "KEPT_BYTES", 20_000)
+    kept, interval = run._Kept(), sys.getswitchinterval()
+
+    def work(first):
+        for i in range(3000):
+            made = SimpleNamespace(outputs=np.zeros(100), columns=None, gram=np.zeros(100))
+            key = (7 * i + first) % 40
+            if kept.find(key, 0, columns=False) is None:
+                kept.add(key, made, None, None)
+
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(work, range(4)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert kept._bytes == sum(run._measure_bytes(each) for each, *_ in kept._passes.values()) <= run.KEPT_BYTES
