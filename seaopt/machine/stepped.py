@@ -52,7 +52,8 @@ class Setting:
         if isinstance(law, ForceMPC):
             return runnable(self.controller)
         if isinstance(law, RunnableSchedule):
-            return law.freeze(self.ticks.middle or law.fallback, self.controller.compensation)
+            middle = self.ticks.middle
+            return law.freeze(law.fallback if middle is None else middle, self.controller.compensation)
         return law
 
 

@@ -10,6 +10,8 @@ import pytest
 import seaopt as so
 from seaopt.control import LawState, MPCSpec, force_mpc, runnable, tune_schedule
 from seaopt.control.running.law_step import run_law
+from seaopt.machine.stepped import Setting
+from seaopt.machine.ticks import Ticks
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES, REFERENCE, respond
 
@@ -57,6 +59,16 @@ def test_a_schedule_that_was_given_another_place_is_named(schedule, scheduled, g
     )
     (row,) = so.accept(schedule, [log]).replays
     assert (row.causes[0].kind, row.causes[0].what, row.causes[0].value) == (kind, "k", value)
+
+
+def test_a_schedule_at_exactly_zero_is_not_taken_at_its_fallback(schedule):
+    zeros = np.zeros(100)
+    columns = dict.fromkeys(("reference", "command", "place"), zeros)
+    ticks = Ticks(source="log", rate_hz=1e3, measured=zeros[:, None], further=np.zeros((100, 0)), **columns)
+    law = schedule.runnable()
+    setting = Setting(controller=schedule.at(5e5), law=law, ticks=ticks)
+    assert np.array_equal(setting.linear.d_measurement, law.freeze(0.0, None).d_measurement)
+    assert not np.array_equal(setting.linear.d_measurement, law.freeze(law.fallback, None).d_measurement)
 
 
 def test_where_a_schedule_stood_is_said_or_asked_for(schedule, scheduled):
