@@ -240,6 +240,8 @@ def _hash(source: Controller | ScheduledController) -> str:
 def list_ticks(source: Source, logs: Sequence[Log], reference: str | None, at: float | None) -> list[Ticks]:
     """Return the ticks of logs. Raises LogError: those of a schedule stand at different values, or at none of it."""
     over = source.over if isinstance(source, ScheduledController) else None
+    if at is not None:
+        require_number(at, "at", LogError)
     if at is not None and over is None:
         raise LogError(f"at = {at:g}: the law is not scheduled; leave it out")
     law = stand(source, at)
@@ -247,7 +249,7 @@ def list_ticks(source: Source, logs: Sequence[Log], reference: str | None, at: f
     if not isinstance(source, ScheduledController):
         return rows
     low, high = source.points[0], source.points[-1]
-    middles = [ticks.middle or 0.0 for ticks in rows] + ([] if at is None else [require_number(at, "at", LogError)])
+    middles = [ticks.middle or 0.0 for ticks in rows] + ([] if at is None else [at])
     near = SAME_PLACE * (high - low)
     for middle in middles:
         if not low - near <= middle <= high + near:

@@ -138,6 +138,12 @@ def test_what_a_log_lacks_is_said_with_what_to_record(controller, bench):
         so.accept(controller, [log.between(0.0, 0.02)])
 
 
+def test_a_place_that_is_no_number_is_refused(controller, bench):
+    log = bench.log(Machine(), REFERENCE[:200])
+    with pytest.raises(so.SeaoptError, match="at = 'x'"):
+        so.accept(controller, [log], at="x")
+
+
 def test_a_law_with_gravity_compensation_is_replayed_from_the_middle_of_a_run_and_its_fault_is_named():
     from seaopt.control import CompensateGravity, SampledLoop, add_compensation, run_loop, runnable
 
