@@ -19,9 +19,11 @@ def test_the_package_runs_as_the_command():
 
 
 @pytest.mark.parametrize("module", ["seaopt.errors", "typer", "seaopt.cli.main"])
-def test_ctrl_c_among_the_imports_is_one_line_too(module):
+def test_ctrl_c_among_the_imports_is_one_line_too(module, tmp_path):
     """It came out as a traceback, or as an error of the import that it hit."""
-    options = [sys.executable, "-X", "importtime", "-m", "seaopt", "inspect", "none.csv"]
+    log = tmp_path / "log.csv"  # long enough that the command still reads it when the signal comes
+    log.write_text("time,F1\n" + "".join(f"{1e-3 * k:.3f},{k % 7}\n" for k in range(100_000)))
+    options = [sys.executable, "-X", "importtime", "-m", "seaopt", "inspect", str(log)]
     with subprocess.Popen(options, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         lines = []

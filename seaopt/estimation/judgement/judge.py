@@ -284,7 +284,9 @@ def _find_unexplained(
 
 def _explain_worse(fit: Fit, where: str) -> str:
     """Return why a constant explains an output better: by a regression of it on the model's, its sign or unit."""
-    name, output = where.rsplit(".", 1)
+    name, output = next(
+        (name, output) for name, row in fit.outputs.items() for output in row if f"{name}.{output}" == where
+    )
     run = fit.predict(next(each for each in fit.experiments if each.name == name))
     there = np.isfinite(run.measured[output]) & np.isfinite(run.model[output])
     measured, model = (each[output][there] - each[output][there].mean() for each in (run.measured, run.model))
