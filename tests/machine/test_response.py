@@ -11,7 +11,9 @@ import scipy.stats
 import seaopt as so
 from seaopt.machine.excitation import design_excitation
 from seaopt.machine.response.discs import Ratio
+from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import cut_periods, find_period
+from seaopt.machine.response.verdicts import Measured
 from seaopt.machine.ticks import take_ticks
 from tests.machine.simulator import Bench, Machine, multisine
 
@@ -207,3 +209,25 @@ def test_with_dry_friction_fewer_than_six_sets_of_phases_confirm_nothing(dry):
     log = bench.log(replace(Machine(), coulomb=FRICTION, smoothing=5e-3), reference[:8000])
     response = so.accept(bench.controller, [log]).response
     assert response.needs_phases and {row.outcome for row in response.judged} == {"undecided"}
+
+
+def test_margins_of_a_loop_that_crosses_a_gain_of_one_three_times(controller):
+    f = np.geomspace(1.0, 200.0, 20001)
+    w, s, late = 2.0 * np.pi * f, 2j * np.pi * f, 0.0085
+    for gain in (9.0, 4.0):
+        loop = 2.0 * np.pi * gain / s / ((f / 70.0) ** 2 * -1.0 + 0.04j * f / 70.0 + 1.0) * np.exp(-s * late)
+        at = np.flatnonzero(np.diff(np.abs(loop) > 1.0))
+        margins = (np.angle(loop[at]) + 2.0 * np.pi) % (2.0 * np.pi) - np.pi
+        turns = np.flatnonzero((np.diff(np.sign(loop.imag)) != 0.0) & (loop.real[:-1] < 0.0))
+        truth = {
+            "gain margin": min(-20.0 * np.log10(np.abs(loop[turns])), key=abs),
+            "phase margin": np.degrees(margins[np.argmin(np.abs(margins))]),
+            "delay margin": 1e3 * np.min(margins % (2.0 * np.pi) / w[at]),
+        }
+        ratio = Ratio(numerator=np.tile(loop, (2, 1)), denominator=np.ones((2, f.size)) + 0j)
+        counts = {"periods": 2, "blocks": 2, "phases": 1, "amplitude": 1.0, "saturated": 0}
+        part = Measured(f=f, loop=ratio, tracking=ratio, plants=(ratio,), **counts)
+        rows = {row.name: row.value for row in list_margins(controller, [part], 0.05)}
+        assert gain != 9.0 or np.isclose(rows["phase margin"], 61.68, atol=0.05)  # the others are -125 and 64 degrees
+        assert rows.keys() == truth.keys()
+        assert all(np.isclose(rows[name], truth[name], rtol=1e-2) for name in rows), (rows, truth)

@@ -25,7 +25,7 @@ STEEPEST = 10.0  # of one over the other, beyond which a crossing is not told
 
 
 def list_margins(controller: Controller, measured: Sequence[Measured], alpha: float) -> list[Judged]:
-    """Return the margins of a measured loop, the smallest of all amplitudes; those that it crosses for."""
+    """Return the margins of a measured loop, the smallest by size of all amplitudes; those that it crosses for."""
     figures = controller.achieved
     predicted = {
         "gain margin": figures.gain_margin_db,
@@ -35,7 +35,9 @@ def list_margins(controller: Controller, measured: Sequence[Measured], alpha: fl
     smallest: dict[str, Judged] = {}
     for row in (row for part in measured for row in _find_margins(part, alpha)):
         before = smallest.get(row.name)
-        if before is None or (row.value is not None and before.value is not None and row.value < before.value):
+        if before is None or (
+            row.value is not None and before.value is not None and abs(row.value) < abs(before.value)
+        ):
             smallest[row.name] = row
     return [_predict(smallest[name], value) for name, value in predicted.items() if name in smallest]
 
@@ -49,20 +51,21 @@ def _find_margins(part: Measured, alpha: float) -> Iterator[Judged]:
     """Yield the margins at each crossing of a loop."""
     loop, radius = part.loop.disc(alpha)
     size, phase, at = np.log(np.abs(loop)), np.unwrap(np.angle(loop)), np.log(part.f)
-    phase = phase - 2.0 * np.pi * round((phase[0] + 0.5 * np.pi) / (2.0 * np.pi))  # begins about -90 degrees
+    turns = np.floor((phase + np.pi) / (2.0 * np.pi))  # changes where the loop crosses -180 degrees
     share = radius / np.abs(loop)
     for k in range(part.f.size - 1):
         rise, turn, error = size[k + 1] - size[k], phase[k + 1] - phase[k], float(max(share[k], share[k + 1]))
-        for over in (-math.pi, -3.0 * math.pi):
-            if (phase[k] - over) * (phase[k + 1] - over) <= 0.0 and turn:
-                t = (over - phase[k]) / turn
-                wide = DECIBEL * error * (1.0 + min(abs(rise / turn), STEEPEST))
-                yield _make("gain margin", -DECIBEL * float(size[k] + t * rise), wide, "dB", _hertz(at, k, t))
+        if turns[k] != turns[k + 1]:
+            t = (math.pi * (2.0 * max(turns[k], turns[k + 1]) - 1.0) - phase[k]) / turn
+            wide = DECIBEL * error * (1.0 + min(abs(rise / turn), STEEPEST))
+            yield _make("gain margin", -DECIBEL * float(size[k] + t * rise), wide, "dB", _hertz(at, k, t))
         if size[k] * size[k + 1] <= 0.0 and rise:
             t = -size[k] / rise
-            left = math.pi + float(phase[k] + t * turn)
+            left = (math.pi + float(phase[k] + t * turn)) % (2.0 * math.pi)  # until the loop is later by a turn
             wide, hertz = error * (1.0 + min(abs(turn / rise), STEEPEST)), _hertz(at, k, t)
-            yield _make("phase margin", math.degrees(left), math.degrees(wide), "deg", hertz)
+            yield _make(
+                "phase margin", math.degrees(left - 2.0 * math.pi * (left > math.pi)), math.degrees(wide), "deg", hertz
+            )
             per = 1e3 / (2.0 * math.pi * hertz)
             yield _make("delay margin", per * left, per * (wide + abs(left) * error), "ms", hertz)
 
