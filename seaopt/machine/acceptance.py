@@ -162,7 +162,7 @@ def accept(
     >>> spec = so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0)
     >>> stand, thor = so.plants.high_impedance(), so.plants.thor()
     >>> controller = so.tune(stand, thor, spec)
-    >>> reference = 100.0 * np.sign(np.sin(20.0 * np.arange(1000) * 1e-3))
+    >>> reference = 40.0 * np.sign(np.sin(20.0 * np.arange(1000) * 1e-3))
     >>> force, effort = controller.close(stand, thor).simulate(reference)
     >>> log = so.Log.from_arrays(
     ...     time=1e-3 * np.arange(1000), reference=reference, F1=force, I=controller.per_effort * effort

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from types import SimpleNamespace
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from seaopt.errors import LogError, SimulationError
 from seaopt.simulation import (
     Clock,
     Layout,
+    Model,
     Point,
     Segment,
     Weights,
@@ -32,6 +33,7 @@ from seaopt.simulation import (
 from seaopt.simulation.compiled import Program
 from seaopt.simulation.interpreted import interpret_pass
 from seaopt.simulation.native import find_compiler
+from seaopt.simulation.passes import Pass
 from tests.casadi_functions import compile_expression
 
 RATE = 400.0
@@ -393,13 +395,14 @@ def test_threads_share_the_passes_that_are_kept(monkeypatch):
     """Each adds and drops: the oldest was looked for while another thread changed what there is."""
     monkeypatch.setattr(run, "KEPT_BYTES", 20_000)
     kept, interval = run._Kept(), sys.getswitchinterval()
+    model, segment = (create_autospec(kind, instance=True) for kind in (Model, Segment))
 
     def work(first):
         for i in range(3000):
-            made = SimpleNamespace(outputs=np.zeros(100), columns=None, gram=np.zeros(100))
+            made = Pass(gram=np.zeros((1, 10, 10)), loss=np.zeros(1), count=np.zeros(1), outputs=np.zeros((100, 1)))
             key = (7 * i + first) % 40
             if kept.find(key, 0, columns=False) is None:
-                kept.add(key, made, None, None)
+                kept.add(key, made, model, segment)
 
     sys.setswitchinterval(1e-6)
     try:

@@ -256,7 +256,7 @@ def test_a_schedule_logs_its_variable(precision, compiler, tmp_path):
     assert log.hash.decode() == hash_law(schedule.runnable())
 
 
-@pytest.mark.parametrize("rows", [0, 1, 3, 100, 1 << 21, 2.0, "512", True])
+@pytest.mark.parametrize("rows", [0, 1, 3, 100, 1 << 21, True])
 def test_rows_are_a_power_of_two(rows, tuned, tmp_path):
     with pytest.raises(ControlError, match=f"log_rows = {rows!r} is not a power of two"):
         export(tuned, tmp_path, log_rows=rows)
