@@ -242,8 +242,8 @@ def list_ticks(source: Source, logs: Sequence[Log], reference: str | None, at: f
     over = source.over if isinstance(source, ScheduledController) else None
     if at is not None:
         require_number(at, "at", LogError)
-    if at is not None and over is None:
-        raise LogError(f"at = {at:g}: the law is not scheduled; leave it out")
+        if over is None:
+            raise LogError(f"at = {at:g}: the law is not scheduled; leave it out")
     law = stand(source, at)
     rows = [take_ticks(law, log, reference, over, at) for log in logs]
     if not isinstance(source, ScheduledController):

@@ -21,7 +21,7 @@ from seaopt.machine.ticks import Ticks
 from seaopt.records import record
 
 MOST = 20  # ticks per row
-SAME_RATE = 0.02  # relative
+SAME_RATE = 0.02  # relative: of the log's clock and the law's, or a whole number of its ticks
 RISK = 0.01  # that a line of this law is taken for another's
 OFF = 0.01  # of the command at a line, that is as good as nothing
 WIDEST, FEWEST_LINES = 0.3, 8  # radius of a disc that still says something; how many do

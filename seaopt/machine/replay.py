@@ -30,7 +30,7 @@ from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.errors import LogError, SeaoptError
 from seaopt.logs.quality.faults import find_quantisation
-from seaopt.machine.decimated import count_ticks_per_row, match_lines
+from seaopt.machine.decimated import SAME_RATE, count_ticks_per_row, match_lines
 from seaopt.machine.stepped import Setting, Source, State, limit_law, list_starts, make_setting, run_setting
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
@@ -47,7 +47,6 @@ LONGEST_RESPONSE = 5000  # rows over which an error of rounding is added up
 WINDOW = 2000  # rows on which causes are tried, about the largest mismatch
 EVERY = (2, 3, 4, 5, 10)  # rows per tick of a law that is slower than the logger
 UNITS = tuple(each**power for each in (1e3, 60.0 / (2.0 * math.pi), 180.0 / math.pi, 1e6, 1e2) for power in (-1, 1))
-SAME_RATE = 0.02  # relative: of the log's clock and the law's
 SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
 MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
 MOST_CAUSES = 6

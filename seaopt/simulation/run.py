@@ -134,8 +134,15 @@ def run_passes(
     key = _key(model, segment, point, x0, chosen) if kept is not None else None
     result = kept.find(key, rows, columns=columns or keep) if kept is not None else None
     if result is None:
-        keep = keep and kept is not None
-        result = _run(model, segment, point, chosen, last, x0, sums, last if keep else rows, columns or keep, states)
+        whole = keep and kept is not None
+        made = last if whole else rows
+        program = Program.make(model, segment, point, chosen)
+        if program is None:
+            result = interpret_pass(model, segment, point, chosen, last, x0)
+        else:
+            result = program.run(
+                0, last, x0, sums=sums, outputs=made > 0, output_rows=made, columns=columns or whole, states=states
+            )
         if kept is not None:
             kept.add(key, result, model, segment)
     return replace(
@@ -144,24 +151,6 @@ def run_passes(
         columns=result.columns if columns else None,
         states=result.states if states else None,
     )
-
-
-def _run(
-    model: Model,
-    segment: Segment,
-    point: Point,
-    weights: Weights,
-    last: int,
-    x0: Float[np.ndarray, " nx"],
-    sums: bool,
-    rows: int,
-    columns: bool,
-    states: bool,
-) -> Pass:
-    program = Program.make(model, segment, point, weights)
-    if program is None:
-        return interpret_pass(model, segment, point, weights, last, x0)
-    return program.run(0, last, x0, sums=sums, outputs=rows > 0, output_rows=rows, columns=columns, states=states)
 
 
 def stream(

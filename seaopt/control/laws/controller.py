@@ -12,7 +12,7 @@ from seaopt.codec import to_content
 from seaopt.control.laws.command import Command, actuation_notes, limit_notes, name_rates
 from seaopt.control.laws.delay import LoopDelays, place_drive_delay
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
-from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.laws.plausibility import PlausibilityGate, list_further
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.stored import (
     CONTROLLER_SCHEMA,
@@ -155,8 +155,7 @@ class Controller(LoopDelays, Result, Worded):
     @property
     def further(self) -> tuple[str, ...]:
         """The outputs that its terms read besides, then those that its gate does."""
-        terms = () if self.compensation is None else self.compensation.reads
-        return tuple(dict.fromkeys((*terms, *(() if self.gate is None else self.gate.reads))))
+        return list_further(self.compensation, self.gate)
 
     @property
     def speed_loop(self) -> SpeedLoop | None:

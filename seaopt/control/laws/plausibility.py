@@ -40,6 +40,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.codec import Constraints
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.errors import ControlError, require_number
 from seaopt.formatting import join_words
@@ -444,6 +445,12 @@ class PlausibilityGate:
             f"Readings from {low:g} to {high:g} {unit} that move by up to {self.max_step_N:.4g} {unit} a sample{near} "
             f"are believed, {self.max_held} others in a row are bridged"
         )
+
+
+def list_further(terms: Compensation | None, gate: PlausibilityGate | None) -> tuple[str, ...]:
+    """Return the outputs that the terms of a law read besides its signals, then those that its gate does."""
+    read = () if terms is None else terms.reads
+    return tuple(dict.fromkeys((*read, *(() if gate is None else gate.reads))))
 
 
 def largest_step(plant: DigitalPlant, effort_limit: float) -> float:

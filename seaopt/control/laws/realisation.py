@@ -40,7 +40,7 @@ from jaxtyping import Float
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.plausibility import LARGEST, GateState, PlausibilityGate, is_number
+from seaopt.control.laws.plausibility import LARGEST, GateState, PlausibilityGate, is_number, list_further
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import Gains
 from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
@@ -128,8 +128,7 @@ class Guarded:
     @property
     def further(self) -> tuple[str, ...]:
         """The outputs that its terms read besides, then those that its gate does."""
-        terms = () if self.compensation is None else self.compensation.reads
-        return tuple(dict.fromkeys((*terms, *(() if self.gate is None else self.gate.reads))))
+        return list_further(self.compensation, self.gate)
 
     @property
     def force_limit_N(self) -> float:

@@ -55,7 +55,8 @@ class Hypothesis:
 
     Those that it frees are the first of each start; `fixed` are chosen once. What is `searched` is free in the refit
     alone, and fixed at its value where the effect is taken: logs hardly tell how large it is. `usual` is of what logs
-    often do not show at all: a size that actuators have, with a spring of that stiffness (`silence`).
+    often do not show at all: a size that actuators have, with a spring of that stiffness (`silence`); `built_in` the
+    parameter by which a plant has it without the part.
     """
 
     effect: str
@@ -64,6 +65,7 @@ class Hypothesis:
     fixed: Callable[[Sizes], Mapping[str, float]] = lambda sizes: {}
     searched: tuple[str, ...] = ()
     usual: Callable[[float], float] | None = None
+    built_in: Callable[[Plant], str | None] = lambda plant: None
     lag: Callable[[Mapping[str, float]], float] = lambda start: 0.0  # s, that a fitted delay has in place of the effect
 
 
@@ -123,6 +125,7 @@ HYPOTHESES = (
         part="spring_damping",
         starts=_zero("c_k"),
         usual=lambda stiffness: 1e-3 * stiffness,
+        built_in=lambda plant: None if plant.spring is None else plant.spring.damper,
     ),
     Hypothesis(
         effect="the spring loses energy in each cycle",

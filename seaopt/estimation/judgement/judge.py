@@ -284,10 +284,10 @@ def _find_unexplained(
 
 def _explain_worse(fit: Fit, where: str) -> str:
     """Return why a constant explains an output better: by a regression of it on the model's, its sign or unit."""
-    name, output = next(
-        (name, output) for name, row in fit.outputs.items() for output in row if f"{name}.{output}" == where
+    experiment, output = next(
+        (each, output) for each in fit.experiments for output in each.outputs if f"{each.name}.{output}" == where
     )
-    run = fit.predict(next(each for each in fit.experiments if each.name == name))
+    run = fit.predict(experiment)
     there = np.isfinite(run.measured[output]) & np.isfinite(run.model[output])
     measured, model = (each[output][there] - each[output][there].mean() for each in (run.measured, run.model))
     both, energy = float(measured @ model), float(model @ model)

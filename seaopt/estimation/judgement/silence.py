@@ -103,12 +103,11 @@ def _add_each(fit: Fit) -> Iterator[_Addition]:
         changed: dict[str, Experiment] = {}
         names: set[str] = set()
         for name, experiment in experiments.items():
-            plant, damper = experiment.plant, experiment.plant.spring and experiment.plant.spring.damper
-            if hypothesis.part == "spring_damping" and damper:
-                if damper not in experiment.parameters:
+            if (built_in := hypothesis.built_in(experiment.plant)) is not None:
+                if built_in not in experiment.parameters:
                     changed[name] = experiment
-                    names.add(damper)
-            elif (plant := _add(plant, hypothesis.part)) is not None:
+                    names.add(built_in)
+            elif (plant := _add(experiment.plant, hypothesis.part)) is not None:
                 changed[name] = replace(experiment, plant=plant)
                 names |= plant.parameters.keys() - experiment.plant.parameters.keys()
         if len(names) != 1:
