@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 SHELL  := /bin/sh
 PYTEST := $(BIN)/python -m pytest
 
-.PHONY: demo test slow check lint types contract notebooks docs floors golden bench bench-peers truth fuzz nocompiler clean setup
+.PHONY: demo test slow check lint types contract notebooks docs floors golden bench bench-check bench-peers truth fuzz nocompiler clean setup
 .DEFAULT_GOAL := demo
 
 # Every pass both ways, and fits by each method; the rest would take an hour in CasADi's virtual machine.
@@ -81,12 +81,14 @@ $(DOCS)/.ready: pyproject.toml constraints.txt tools/setup.sh
 
 check: test slow nocompiler lint types contract notebooks
 
+# What things cost beside bare NumPy, SciPy, polars and CasADi, in processor time: benchmarks/table.json and .md. The
+# check measures again, into out/bench.json, and names what lost more than 10 %.
+BENCH := $(BIN)/python benchmarks/table.py
 bench: $(READY)
-	$(PYTEST) benchmarks -q -s --benchmark-only -p no:xdist -o python_files='bench_*.py' -o filterwarnings=default
-	$(BIN)/python benchmarks/bench_fit.py
-	$(BIN)/python benchmarks/bench_read.py
-	$(BIN)/python benchmarks/bench_certify.py
-	$(BIN)/python benchmarks/bench_mpc.py
+	$(BENCH) --out benchmarks/table.json
+
+bench-check: $(READY)
+	$(BENCH) --out out/bench.json --check benchmarks/table.json
 
 # Other estimators on one problem, each in an environment of its own; ARGS="--only jax,seaopt" for some of them.
 bench-peers: $(READY)
