@@ -1,7 +1,8 @@
-"""How far a command has come: a bar with the time left on a terminal, now and then a line elsewhere."""
+"""How far a command has come: a bar with the most time left on a terminal, now and then a line elsewhere."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
@@ -17,38 +18,51 @@ from seaopt.progress import Progress
 
 SHOWN_AFTER_S = 2.0  # a stage that is done before shows no progress
 LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
+CAUTION = 1.5  # times what the measured speed makes of the remaining share
 RECENT, LEAST_RECENT_S = 0.25, 2.0  # of the time spent: the part whose speed counts by itself
 MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 REPORT_S = 30.0  # between lines of progress that go to a file
 
 
 class TimeLeft:
-    """How long a stage still takes, by the speed of all of it or of its last part, whichever is slower.
+    """At most how long a stage still takes, by the speed of all of it or of its last part, whichever is slower.
 
-    A stage may turn slow late: a fit that is done searching in a second looks for causes for half a minute. Nothing is
-    told before the share `told_from`: what comes before has no scale.
+    A stage may turn slow late: a fit that is done searching in a second looks for causes for half a minute. So what is
+    measured is taken with caution, what is left takes at least as long as the longest part did, and where it is more
+    than was told before nothing is told: the number only falls. Nothing is told before the share `told_from`: what
+    comes before has no scale.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, told_from: float = LEAST_SHARE) -> None:
         self._clock, self._told_from = clock, told_from
         self._marks = [(clock(), 0.0)]
+        self._longest, self._end = 0.0, math.inf
 
     def move(self, share: float) -> None:
         """Note the share that is done now."""
-        self._marks.append((self._clock(), share))
+        now, (last, before) = self._clock(), self._marks[-1]
+        if before >= self._told_from:
+            self._longest = max(self._longest, now - last)
+        self._marks.append((now, share))
 
     def tell(self) -> str:
-        """Return what to say; empty where it cannot be told yet."""
+        """Return what to say; empty where it cannot be told."""
         now, marks = self._clock(), list(self._marks)  # others may move it meanwhile
         (started, _), (last, share) = marks[0], marks[-1]
         part = max(RECENT * (now - started), LEAST_RECENT_S)
         since, before = next((mark for mark in reversed(marks) if mark[0] <= last - part), marks[0])
-        if share < self._told_from or share <= before:
+        if share < self._told_from or not before < share < 1.0:
             return ""
         slowness = max((last - started) / share, (last - since) / (share - before))
         silent = now - last  # what is silent for longer than was told takes longer
-        left_s = max((1.0 - share) * slowness - silent, silent) if share < 1.0 else 0.0
-        return f"{left_s:.0f} s left" if left_s < 100.0 else f"{left_s / 60.0:.0f} min left"
+        end = now + CAUTION * max((1.0 - share) * slowness - silent, self._longest - silent, silent)
+        if end > self._end:
+            return ""
+        self._end = end
+        left_s = end - now
+        if left_s > 90.0:
+            return f"at most {math.ceil(left_s / 60.0)} min left"
+        return f"at most {10 * math.ceil(left_s / 10.0)} s left"
 
 
 class _Left(ProgressColumn):

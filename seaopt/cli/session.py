@@ -36,7 +36,7 @@ from seaopt.logs import Log, write_log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, Stages, read_problem
-from seaopt.problem.explained import adopt, find_explanation, say_unexplained
+from seaopt.problem.explained import adopt, find_explanation, say_adopted, say_unexplained
 from seaopt.problem.problem import WRITE_ONE
 from seaopt.problem.stages import (
     assess_problem,
@@ -167,7 +167,9 @@ class Session:
             "simulate": self._simulate, "fit": self._fit, "tune": self._tune, "certify": self._certify,
             "report": self._report, "frf": self._frf, "sweep": self._sweep,
         }  # fmt: skip
-        told_from = LEAST_SHARE + (READING + (1.0 - READING) * SCALED if stage == "fit" else 0.0)
+        told_from = LEAST_SHARE
+        if stage == "fit":  # whether another fit follows is not known
+            told_from = 1.0 if self.explain else LEAST_SHARE + READING + (1.0 - READING) * SCALED
         with ExitStack() as stack:
             if self.workers is not None and stage in PARALLEL:
                 self.executor = Processes(self.workers)
@@ -324,7 +326,7 @@ class Session:
         self.results["simulate"] = runs
 
     def _fit(self, tell: Progress) -> None:
-        reading, fitting = divide(tell, READING, 1.0 - READING)
+        reading, fitting, again = divide(tell, READING, 1.0 - READING, 1.0 if self.explain else 0.0)
         reading("reading logs", 0.0)
         result = fit_problem(self.problem, self.experiments(), progress=fitting)
         (self.folder / EXPLAINED).unlink(missing_ok=True)  # of another fit
@@ -333,12 +335,12 @@ class Session:
             if found is None:
                 self.say(say_unexplained(result.hypotheses))
             else:
-                result = self._explain(found, result)
+                result = self._explain(found, result, again)
         self.results["fit"] = result
         self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})
 
-    def _explain(self, found: HypothesisTrial, before: Fit) -> Fit:
+    def _explain(self, found: HypothesisTrial, before: Fit, tell: Progress) -> Fit:
         """Return the fit of the problem with what explains its logs, which is the problem from here on."""
         self.problem, lines = adopt(self.problem, found)
         self._experiments = None
@@ -346,11 +348,9 @@ class Session:
         write_text(place, lines + "\n")
         self.written.append(place)
         self.say(
-            f"explained: {found.effect}: the residual is {found.excess:.3g} times its sensor's noise in place of "
-            f"{found.excess_before:.3g}; fitting again with the lines in {place}, which belong into "
-            f"{self.problem.source}"
+            f"{say_adopted(found)}; fitting again with the lines in {place}, which belong into {self.problem.source}"
         )
-        result = fit_problem(self.problem, self.experiments())
+        result = fit_problem(self.problem, self.experiments(), progress=tell)
         return replace(result, hypotheses=(*before.hypotheses, *result.hypotheses))
 
     def validate(self, log: Path, like: str | None, as_json: bool, amount: Amount = "usual") -> bool:

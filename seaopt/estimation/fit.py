@@ -37,9 +37,9 @@ from seaopt.simulation import keep_passes
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import unit_after
 
-SEARCH, JUDGEMENT = 0.25, 0.75  # of the time of a fit that goes wrong; one that does not ends early
-# How many iterations follow, and what causes take, is unknown; from here the remaining ones are a scale.
-SCALED = SEARCH + JUDGEMENT * TESTS / (TESTS + CAUSES)
+SEARCH, JUDGEMENT = 1.0, TESTS + CAUSES  # of the time of a fit that goes wrong, at most; one that does not ends early
+# How many iterations follow is unknown; from here on what the judgement may take is a scale.
+SCALED = (SEARCH + TESTS) / (SEARCH + JUDGEMENT)
 USUAL_ITERATIONS = 10  # of a whole fit
 SLOW_STEPS, SLOW = 2.0, 1e5  # steps in a sample, and in a pass, from which smoothed friction is said to be slow
 SHARP_STEPS = 8.0  # in a sample, from which so slow a friction is fitted as it jumps

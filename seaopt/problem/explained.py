@@ -9,6 +9,7 @@ from typing import Any
 from seaopt.documents import check_table
 from seaopt.errors import ProblemError
 from seaopt.estimation import Fit
+from seaopt.estimation.judgement.second_log import FAR
 from seaopt.estimation.result.trials import HypothesisTrial, state_sticking
 from seaopt.problem.problem import Problem
 from seaopt.problem.reading import make_problem
@@ -38,6 +39,17 @@ def say_unexplained(trials: Sequence[HypothesisTrial]) -> str:
         f"{best.excess:.3g} times the sensor's noise of {best.excess_before:.3g}; look for what is not among them, "
         "such as a bench that shakes, another load, or a wrong unit"
     )
+
+
+def say_adopted(trial: HypothesisTrial) -> str:
+    """Return in words what a hypothesis that is added to a problem makes of its residual."""
+    before, after = f"{trial.excess_before:.3g}", f"{trial.excess:.3g}"
+    if trial.excess > FAR:
+        return (
+            f"the best cause found is that {trial.effect}; the residual falls from {before} to {after} times its "
+            "sensor's noise, so that more is missing"
+        )
+    return f"explained: {trial.effect}: the residual is {after} times its sensor's noise in place of {before}"
 
 
 def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:

@@ -10,7 +10,7 @@ import pytest
 
 from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.problem import read_problem
-from seaopt.problem.explained import adopt, say_unexplained
+from seaopt.problem.explained import adopt, say_adopted, say_unexplained
 from tests.actuator_logs import write_csv
 from tests.estimation.judgement.test_hypotheses import TRUTH, record
 
@@ -69,6 +69,16 @@ def test_what_nothing_explains_is_said():
     assert "the best, the motor cogs, leaves 12 times the sensor's noise of 30" in say_unexplained(trials)
     tied = tuple(replace(each, outcome="tied") for each in trials)
     assert "the spring hardens (hardening); or the motor cogs" in say_unexplained(tied)
+
+
+def test_what_leaves_a_large_residual_is_not_called_explained():
+    trial = HypothesisTrial(
+        effect="the current lags its command", parts=("current_loop",), outcome="adopted", excess_before=443.0,
+        excess=37.8, frees={}, fixed={}, parameters={}, evaluations=9,
+    )  # fmt: skip
+    assert "explained" not in say_adopted(trial)
+    assert "falls from 443 to 37.8 times its sensor's noise, so that more is missing" in say_adopted(trial)
+    assert say_adopted(replace(trial, excess=1.1)).startswith("explained: the current lags its command")
 
 
 def test_what_is_found_is_added_and_fitted(problem, seaopt):

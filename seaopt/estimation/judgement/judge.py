@@ -42,7 +42,7 @@ from seaopt.units import unit_after
 
 EVALUATIONS = 40  # of a fit, at least: one of a linear plant that starts well takes a few
 OF_HYPOTHESES, OF_CAUSES = 3, 2  # times those, that refits of hypotheses and of other causes may take
-TESTS, CAUSES = 1.0, 3.0  # of the time of a judgement that tries causes
+TESTS, CAUSES = 1.0, float(OF_HYPOTHESES + OF_CAUSES)  # times the search, that a judgement may take
 HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
 WORSE = -1.0  # fit percent below which a constant explains more, beyond rounding and an offset that is fixed
 ALIKE = 0.95  # of an output's energy, that a multiple of the model explains where only sign or unit are wrong
@@ -117,13 +117,14 @@ def judge(
     )
     wrong = noticed or bool(suspects)
     little = any(finding.kind == "explained" for finding in findings)
-    refitting, trying = divide(trying, OF_HYPOTHESES, OF_CAUSES)
+    refitting = divide(trying, OF_HYPOTHESES, OF_CAUSES)[0]
     evaluations, begun = max(evaluations, EVALUATIONS), count_evaluations()
     doubtful = _hangs_on_little(fit, findings)
     search = Search() if little else search_hypotheses(fit, OF_HYPOTHESES * evaluations, refitting, doubtful=doubtful)
     if search.partial is not None:
         fit, findings = _reach(fit, findings, error, search.partial)
     if wrong or search.able:
+        spent, budget = count_evaluations() - begun, (OF_HYPOTHESES + OF_CAUSES) * evaluations
         causes = find_causes(
             fit,
             residuals,
@@ -132,8 +133,8 @@ def judge(
             poor=little or fit.status == "not_identifiable",
             noticed=noticed,
             hypotheses=search.able,
-            budget=max(1, (OF_HYPOTHESES + OF_CAUSES) * evaluations - (count_evaluations() - begun)),
-            progress=trying,
+            budget=max(1, budget - spent),
+            progress=divide(trying, spent, max(1, budget - spent))[1],
         )
         named = list(_name_causes(fit, causes, suspects))
         told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)
