@@ -24,6 +24,7 @@ from typing import Any, Literal
 from seaopt.control.loops.loop import DROOP_BAND, FALLEN_ABOVE, SHOULDER, SHOULDER_FALL, STABLE, LoopFigures
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.errors import ControlError
+from seaopt.formatting import join_words
 from seaopt.records import record
 from seaopt.units import LINEAR
 
@@ -123,6 +124,7 @@ class Limit:
     # meaning, remedy: what it means, and what to do where it is broken
     meaning: str
     remedy: str
+    eased_by: tuple[str, ...] = ()  # other limits that stand in its way where they are active
     unit: str = ""  # of the figure; empty for a ratio
     # default, bandwidth_divisor: what is allowed where the specification leaves it out (None), a number or bandwidth_hz
     # over one; without either it is then not imposed. False in the specification lifts a limit
@@ -160,7 +162,13 @@ class Limit:
     @property
     def description(self) -> str:
         """Its meaning, the plant it judges, its default, and what to do where it is broken."""
-        return f"{self.meaning} ({self.scope}; left out: {self.default_text}). Where it is broken: {self.remedy}."
+        return f"{self.meaning} ({self.scope}; left out: {self.default_text}). Where it is broken: {self.remedies}."
+
+    @property
+    def remedies(self) -> str:
+        """What to do where it is broken, with the other limits to ease where they are active."""
+        active = join_words([f"{name} where it is active" for name in self.eased_by])
+        return f"{self.remedy}, or ease {active}" if active else self.remedy
 
     @property
     def is_default(self) -> bool:
@@ -230,13 +238,13 @@ LIMITS = (
         name="max_sensitivity", label="Ms", figure=lambda loop: loop.figures.ms, sense="at most", scope="every plant",
         above=1.0, default=1.7, curve=LimitCurve(of="1"),
         meaning="Ms, peak of |S|: 1/Ms is the distance of the loop gain from -1",
-        remedy="lower the bandwidth, allow more noise gain, or sample faster",
+        remedy="lower the bandwidth, or sample faster", eased_by=("max_noise_gain",),
     ),
     Limit(
         name="max_complementary", label="Mt", figure=lambda loop: loop.figures.mt, sense="at most",
         scope="every plant", default=1.3, curve=LimitCurve(of="L"),
         meaning="Mt, peak of |L/(1 + L)|: 1/Mt is the relative error of the plant that the loop tolerates",
-        remedy="lower the bandwidth, or raise max_sensitivity with it",
+        remedy="lower the bandwidth", eased_by=("max_sensitivity", "max_noise_gain"),
     ),
     Limit(
         name="min_disk_margin", label="disk margin", figure=lambda loop: loop.figures.disk_margin, sense="at least",
@@ -259,7 +267,8 @@ LIMITS = (
             until_hz=lambda _, bandwidth_hz: bandwidth_hz * DROOP_BAND, floor=True,
         ),
         meaning="how far |F/F_ref| falls below its static value up to a third of the bandwidth",
-        remedy="leave reference_weights tuned, allow more noise gain, or ask for another bandwidth",
+        remedy="leave reference_weights tuned, or ask for another bandwidth",
+        eased_by=("max_sensitivity", "max_noise_gain"),
     ),
     Limit(
         name="max_noise_gain", label="noise gain", figure=lambda loop: loop.figures.noise_gain, sense="at most",
@@ -273,7 +282,7 @@ LIMITS = (
         unit="effort per unit", stuck_too=True, curve=LimitCurve(of="C_v"),
         meaning="peak of |F_m/noise on what the law reads besides|, the largest; of a cascade that of its encoder "
         "(per rad or m), or of its speed",
-        remedy="lower the bandwidth, or allow more noise gain on the regulated signal",
+        remedy="lower the bandwidth", eased_by=("max_noise_gain",),
     ),
     Limit(
         name="min_sensitivity_bandwidth_hz", label="sensitivity bandwidth",
@@ -281,7 +290,8 @@ LIMITS = (
         above=None, bandwidth_divisor=5.0, tolerance=1e-3, reserve="curve",
         curve=LimitCurve(of="1", level=lambda _: HALF_POWER, until_hz=lambda allowed, _: allowed, symbol="|S|"),
         meaning="|S| stays below -3 dB up to here: feedback, not feedforward, makes the bandwidth",
-        remedy="raise max_sensitivity, lower the bandwidth, or shorten the delay",
+        remedy="lower the bandwidth, or shorten the delay",
+        eased_by=("max_sensitivity", "max_complementary", "max_noise_gain"),
     ),
     Limit(
         name="bandwidth_hz", label="bandwidth",
@@ -324,7 +334,7 @@ LIMITS = (
         name="min_friction_margin", label="friction margin", figure=lambda loop: loop.friction_slope, sense="at least",
         scope="every plant", unit="N s/m or N m s/rad",
         meaning="steepest friction, counted from its flattest slope, for which stability is shown",
-        remedy="ask for the largest that the result names, lower the bandwidth, or allow more noise gain",
+        remedy="ask for the largest that the result names, or lower the bandwidth", eased_by=("max_noise_gain",),
     ),
     Limit(
         name="passive_band_hz", label="least Re Z/|Z| in the passive band", sense="at least",

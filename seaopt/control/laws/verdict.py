@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
 
 from seaopt.control.laws.delay import LoopSpec
-from seaopt.control.laws.limits import OTHER_NOISE, Limit, MeasuredLoop, Scope
+from seaopt.control.laws.limits import BY_NAME, LIFTABLE, OTHER_NOISE, Limit, MeasuredLoop, Scope, Sense
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
@@ -18,6 +18,7 @@ from seaopt.formatting import format_count, join_words
 from seaopt.records import record
 
 BLOCKED_CHARACTERS = 145  # of the limits that a message names, so that it stays below three lines of 80
+EASED: dict[str, Sense] = {"raise": "at most", "lower": "at least"}
 NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the reserve, is called active
 
 
@@ -170,6 +171,16 @@ def join_labels(labels: Sequence[str]) -> str:
         name, _, plant = label.removesuffix(")").partition(" (")
         plants.setdefault(name, []).extend([plant] if plant else [])
     return ", ".join(name + _format_plants(named) for name, named in plants.items())
+
+
+def advise_easing(labels: Sequence[str], among: Collection[str] = LIFTABLE) -> str:
+    """Return what to write for other limits than these that bind, as `LimitVerdict.label` names them, all at once: to
+    ease only some lets the next one bind. Only those `among` are eased; "" where none binds.
+    """
+    names = dict.fromkeys(label.partition(" (")[0] for label in labels)
+    binding = [BY_NAME[name] for name in names if name in among and name in BY_NAME]
+    ways = [(verb, [limit.name for limit in binding if limit.sense == sense]) for verb, sense in EASED.items()]
+    return " and ".join(f"{verb} {join_words(named)}" for verb, named in ways if named)
 
 
 def shorten_blocked(blocked: Sequence[str]) -> str:

@@ -69,7 +69,7 @@ def test_the_documentation_has_the_table():
     head, _, *rows = table_of_the_docs()
     assert head == ["limit", "meaning", "the figure is", "of", "unit", "left out", "where it is broken"]
     assert rows == [
-        [f"`{limit.name}`", limit.meaning, limit.sense, limit.scope, limit.unit, limit.default_text, limit.remedy]
+        [f"`{limit.name}`", limit.meaning, limit.sense, limit.scope, limit.unit, limit.default_text, limit.remedies]
         for limit in LIMITS
     ]
 

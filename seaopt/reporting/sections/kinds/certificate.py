@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from seaopt.control.laws.limits import BY_REQUIREMENT
+from seaopt.control import Controller
+from seaopt.control.laws.limits import BY_REQUIREMENT, OTHER_NOISE
+from seaopt.control.laws.verdict import advise_easing
 from seaopt.formatting import MISSING, format_band, format_count, format_number, format_values, join_words
 from seaopt.reporting.figures.certificate import label_requirement
 from seaopt.reporting.sections.data import (
@@ -24,7 +26,7 @@ from seaopt.reporting.sections.kinds.simulated import list_left_out, summarise_f
 from seaopt.reporting.sections.kinds.verification import describe_steps
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.certificate import NO_MODEL
-from seaopt.robustness.certificate.requirement import Failure, group_failures
+from seaopt.robustness.certificate.requirement import DESIGN_PLANT, Failure, Requirement, group_failures
 from seaopt.units import unit_after
 
 FROM_DRAWS = ("monte_carlo_failures", "worst_case", "max_failure_probability")
@@ -33,8 +35,8 @@ REPLAN = "a lower bandwidth_hz in [controller], or narrower ranges in [robustnes
 REMEDIES = {
     **dict.fromkeys(FROM_DRAWS, RETUNE),
     "step_overshoot": "lower max_reference_peak in [controller]",
-    "step_settling_s": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
-    "steady_error": "another bandwidth_hz in [controller], or a sample_rate_hz that is higher",
+    "step_settling_s": "a lower bandwidth_hz in [controller]",
+    "steady_error": "a lower bandwidth_hz in [controller]",
     "sustained_oscillation": "a lower bandwidth_hz, or min_friction_margin in [controller]",
     "impedance_stable": "less stiffness, or more damping, in [impedance]",
     "impedance_rest": "less stiffness, or more damping, in [impedance]",
@@ -47,6 +49,11 @@ REMEDIES = {
     "min_schedule_rate": "a smaller min_rate in [controller.schedule], or a higher bandwidth_hz",
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
 }
+
+
+# The limits that keep the feedback from doing more, by what asks it to.
+MORE_FEEDBACK = ("max_sensitivity", "max_complementary", "min_disk_margin", "max_noise_gain", OTHER_NOISE)
+EASED_BY: dict[str, tuple[str, ...]] = {"step_settling_s": MORE_FEEDBACK, "steady_error": MORE_FEEDBACK}
 
 
 SWINGS = (
@@ -69,8 +76,9 @@ def judge(certificate: Certificate, commands: Commands) -> Verdict:
         text = f"Certificate: passed, {format_count(draws.failures, 'failure')} in {draws.samples} draws{bound}{runs}"
         return Verdict(met=True, text=text)
     broken = [row for row in certificate.requirements if not row.met]
-    reasons = [explain_failure(failure) for failure in group_failures(broken)]
-    remedies = [advise(row.name) for row in broken]
+    failures = group_failures(broken)
+    reasons = [explain_failure(failure) for failure in failures]
+    remedies = [advise(failure.worst, certificate.controller) for failure in failures]
     if certificate.constrained is not None:
         remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]
     first = next((text for text in remedies if text), "")
@@ -99,9 +107,17 @@ def _advise_ranges(certificate: Certificate) -> tuple[str, ...]:
     return ()
 
 
-def advise(name: str) -> str:
-    """Return what to change where a requirement is not met."""
-    return BY_REQUIREMENT[name].remedy if name in BY_REQUIREMENT else REMEDIES.get(name, "")
+def advise(row: Requirement, *controllers: Controller) -> str:
+    """Return what to change where a requirement is not met: by the limits that bind in the laws it is of."""
+    limit, remedy = BY_REQUIREMENT.get(row.name), REMEDIES.get(row.name, "")
+    if limit is not None:
+        plants = {DESIGN_PLANT, *(name for law in controllers for name in law.robust_to)}
+        if limit.scope == "every plant" and row.plant not in plants and all(law.met for law in controllers):
+            return f'add "{row.plant}" to robust_to in [controller]'
+        remedy = limit.remedy
+    among = EASED_BY.get(row.name, ()) if limit is None else limit.eased_by
+    easing = advise_easing([label for law in controllers for label in law.active_constraints], among)
+    return f"{remedy}, or {easing}" if easing else remedy
 
 
 def explain_failure(failure: Failure) -> Reason:

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.command import describe_cascade, name_gain_units
-from seaopt.control.laws.verdict import join_labels, list_design_figures
+from seaopt.control.laws.verdict import advise_easing, join_labels, list_design_figures
 from seaopt.control.loops.law import describe_integrators
 from seaopt.formatting import MISSING, format_band, format_count, format_figure, format_number
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, list_notes
@@ -58,7 +58,8 @@ def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[str, 
     if possible.nearest_hz:
         nearest = min(possible.nearest_hz, key=lambda hz: abs(hz - asked))
         return (text, f"bandwidth_hz = {nearest:.4g} in [controller], or {look}")
-    return (text, f"raise max_sensitivity, or max_noise_gain, in [controller]; {look}")
+    easing = advise_easing(controller.active_constraints)
+    return (text, f"{easing} in [controller]; {look}" if easing else look)
 
 
 def show_costs(asked: float, commands: Commands) -> str:

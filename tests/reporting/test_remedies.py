@@ -1,0 +1,42 @@
+"""What is said to do about a certificate that is refused, done: it has to help."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+import seaopt as so
+from seaopt.control.laws.verdict import advise_easing
+from seaopt.reporting.sections.data import Commands
+from seaopt.reporting.sections.kinds.certificate import advise, judge
+from seaopt.robustness.certificate.requirement import Requirement
+from seaopt.robustness.certificate.simulated import STEPS
+from tests.checks import leave_out
+
+SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.7, max_complementary=1.3)
+
+
+@pytest.fixture(autouse=True)
+def without_steps(monkeypatch):
+    leave_out(monkeypatch, STEPS)
+
+
+def test_a_plant_that_was_not_tuned_for_is_named_and_helps_when_it_is(stand, thor):
+    plants = {"stand": stand, "swing": so.plants.moving_output()}
+    alone = so.tune(stand, thor, SPEC)
+    certificate = so.certify(alone, plants, thor, simulations=False)
+    assert judge(certificate, Commands()).next[0].startswith('add "swing" to robust_to in [controller]')
+    both = so.tune(stand, thor, SPEC, robust_to={"swing": plants["swing"]})
+    assert so.certify(both, plants, thor, simulations=False).met
+
+
+def test_only_a_limit_that_binds_is_eased(stand, thor):
+    controller = so.tune(stand, thor, SPEC)
+    assert not any(name.startswith("max_noise_gain") for name in controller.active_constraints)
+    error = Requirement(name="steady_error", limit=0.03, value=0.04, met=False, plant="stand")
+    text = advise(error, controller)
+    assert "lower bandwidth_hz" in text and "noise" not in text
+    bound = replace(controller, active_constraints=("max_noise_gain", "max_complementary (stand)", "max_noise_gain"))
+    assert advise(error, bound).endswith("or raise max_noise_gain and max_complementary")
+    assert advise_easing(("min_sensitivity_bandwidth_hz", "shoulder_hz")) == "lower min_sensitivity_bandwidth_hz"
