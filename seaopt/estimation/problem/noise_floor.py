@@ -42,6 +42,7 @@ class NoiseFloor:
 
     noise: PerOutput
     rms: PerOutput
+    step: PerOutput  # that a reading is rounded to; 0 where it is not, and where residuals are filtered or predicted
     count: PerOutput  # samples that count
 
     @property
@@ -65,7 +66,7 @@ def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> 
     """Return the noise of an experiment's outputs, and their residuals' rms."""
     loss, gain = experiment.loss, _measure_noise_gain(experiment)
     settle = experiment.weights.settle
-    noise, rms, count = (np.zeros(len(experiment.sigma)) for _ in range(3))
+    noise, rms, step, count = (np.zeros(len(experiment.sigma)) for _ in range(4))
     for output in experiment.outputs:
         o, name, sigma = output.index, output.name, output.sigma
         used = [segment.mark_counted(settle)[:, o] for segment in experiment.segments]
@@ -78,11 +79,12 @@ def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> 
         seconds = [_take_second(loss.slope(part * (gain / sigma)), apart) for part in raw]
         seconds = [part[np.isfinite(part)] for part in seconds]
         neighbours = float(np.sqrt(np.mean(np.concatenate(seconds) ** 2) / 6.0)) if any(map(len, seconds)) else 0.0
-        step = find_quantisation(np.concatenate(output.measured)) / np.sqrt(12.0) * gain / sigma
+        quantum = find_quantisation(np.concatenate(output.measured)) / sigma
+        step[o] = 0.0 if settle or experiment.predictor is not None else quantum
         stated = _weigh_gaussian(loss) if name in experiment.data.sigma else 0.0
         rounding = ROUNDING * output.spread * gain / sigma
-        noise[o] = max(neighbours, step, min(stated, STATED * neighbours), rounding)
-    return NoiseFloor(noise=noise, rms=rms, count=count)
+        noise[o] = max(neighbours, quantum * gain / np.sqrt(12.0), min(stated, STATED * neighbours), rounding)
+    return NoiseFloor(noise=noise, rms=rms, step=step, count=count)
 
 
 def _take_second(values: Float[np.ndarray, " n"], apart: int) -> Float[np.ndarray, " _"]:

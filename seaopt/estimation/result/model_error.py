@@ -8,9 +8,10 @@ of all unknowns and E the columns of those that are wanted
 .. math:: S = (E^T H^{-1} E)^{-1}, \qquad \tilde J_t = J_t H^{-1} E S, \qquad S = \sum_t \tilde J_t^T \tilde J_t + P,
           \qquad g_A = \sum_{t \in A} \tilde J_t^T r_t, \qquad H_A = \sum_{t \in A} \tilde J_t^T \tilde J_t .
 
-- b, the noise: the largest of the std for white residuals, of that for coloured ones (`covariance`), and of what the
-  scores :math:`\tilde J_t^T r_t` vary by within 0.1 s (Newey and West, Econometrica 55, 1987); at least 0.02 % where
-  the residual is more than noise, and as little as a clock of quartz is off by where it is not.
+- b, the noise: the largest of the std for white residuals, of that for coloured ones (`covariance`), of what the
+  scores :math:`\tilde J_t^T r_t` vary by within 0.1 s (Newey and West, Econometrica 55, 1987), and of what the steps of
+  coarse sensors make (`rounding`); at least 0.02 % where the residual is more than noise, and as little as a clock of
+  quartz is off by where it is not.
 - j, parts of the log: without one of 8 contiguous parts the estimates move by :math:`d_k = -(S - H_k)^{-1} g_k`
   (a jackknife of one step: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982);
   :math:`v = \tfrac78 \sum (d_k - \bar d)^2` and :math:`j^2 = \max(0, v - b^2)`. Where few parts have all the
@@ -41,6 +42,7 @@ from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
 from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal, Vector
 from seaopt.estimation.result.covariance import compute_bread, compute_influence, map_to_influence, take_root
+from seaopt.estimation.result.rounding import Rounding
 from seaopt.records import record
 
 PARTS = 8
@@ -102,14 +104,15 @@ def estimate_model_error(
     scores = inverse @ sums.windows @ inverse
     variance = np.where(np.isfinite(np.diag(noise)), np.diag(noise), 0.0)
     white = np.diag(inverse @ sums.power @ inverse)
-    noisy = np.maximum.reduce([variance, white, np.diag(scores)])
+    rounded = inverse @ sums.rounded @ inverse
+    noisy = np.maximum.reduce([variance, white, np.diag(scores), np.diag(rounded)])
     inflation = noisy / np.maximum(np.diag(inverse), 1e-300)
     noise_alone = max(excess.values()) <= LITTLE
     b2 = np.maximum(noisy, ((CLOCK if noise_alone else LEAST_SHARE) * z[stated]) ** 2)
     return ModelError(
         names=names,
         excess=excess,
-        colour=_resize(scores, b2 - variance),
+        colour=_resize(scores + rounded, b2 - variance),
         parts=_jackknife(information, sums, b2, inflation, noise_alone=noise_alone),
         halves=_compare_halves(information, sums, inflation),
         few_values=inverse @ sums.error_power @ inverse * (sums.count / INDEPENDENT),
@@ -130,9 +133,10 @@ def _resize(matrix: ParameterMatrix, variances: ParameterVector) -> ParameterMat
 @record(eq=False)
 class _Sums:
     """Sums over the samples, over the parameters and delays alone: H_k and g_k of parts, and of a half of each split.
-    `share` is how many of the samples are in that half, `windows` the scores' products within a window, `power` and
-    `error_power` the information of the outputs weighted with the power of their residuals and of the model's error,
-    `effect` the largest rms over the outputs' spreads that a unit of each makes.
+    `share` is how many of the samples are in that half, `windows` the scores' products within a window, `power`,
+    `rounded` and `error_power` the information of the outputs weighted with the power of their residuals, with that of
+    the errors that rounding makes of the coarse ones, and with that of the model's error, `effect` the largest rms over
+    the outputs' spreads that a unit of each makes.
     """
 
     information: Float[np.ndarray, "parts q q"]
@@ -142,6 +146,7 @@ class _Sums:
     share: Float[np.ndarray, " halves"]
     windows: ParameterMatrix
     power: ParameterMatrix
+    rounded: ParameterMatrix
     error_power: ParameterMatrix
     effect: ParameterVector
     count: float
@@ -206,7 +211,7 @@ def _sum_parts(
     q, loss = inverse.shape[1], problem.loss
     information, score = np.zeros((PARTS, q, q)), np.zeros((PARTS, q))
     half_information, half_score, in_half = np.zeros((HALVES, q, q)), np.zeros((HALVES, q)), np.zeros(HALVES)
-    windows, power, error_power = (np.zeros((q, q)) for _ in range(3))
+    windows, power, rounded, error_power = (np.zeros((q, q)) for _ in range(4))
     effect = np.zeros(q)
     masks = {
         e.name: [np.any(s.mark_counted(e.weights.settle), axis=1) for s in e.segments] for e in problem.experiments
@@ -220,6 +225,7 @@ def _sum_parts(
         length = max(1, min(round(WINDOW_S / experiment.period), experiment.samples // WINDOWS))
         split = _split(experiment, residuals[experiment.name], masks[experiment.name])
         grams = np.zeros((len(rms2), q, q))
+        coarse = [Rounding.of(step, noise, q) for step, noise in zip(floor.step, floor.noise, strict=True)]
         for segment, high, counted in zip(experiment.segments, split, masks[experiment.name], strict=True):
             order = before + np.cumsum(counted) - counted
             into = map_to_influence(experiment, segment, inverse)
@@ -239,10 +245,15 @@ def _sum_parts(
                     half_score[s] += np.sum(scores[:, mask], axis=1)
                 in_half += np.count_nonzero(high[:, rows], axis=1)
                 grams += np.matmul(along, along.transpose(0, 2, 1))
+                for o, rounding in enumerate(coarse):
+                    if rounding is not None:
+                        rounding.add(along[o], r[o])
                 tail = _add_windows(windows, tail, scores)
             _add_windows(windows, tail, np.zeros((q, length - 1)))
             before += int(np.count_nonzero(counted))
         power += np.tensordot(rms2, grams, 1)
+        for rounding, gram in zip(coarse, grams, strict=True):
+            rounded += rounding.multiply(gram) if rounding is not None else 0.0
         error_power += np.tensordot(rms2 * error, grams, 1)
         size = experiment.sigma / np.maximum(experiment.spread * np.sqrt(np.maximum(floor.count, 1.0)), 1e-300)
         effect = np.maximum(effect, np.max(np.sqrt(np.diagonal(grams, 0, 1, 2)) * size[:, None], axis=0, initial=0.0))
@@ -254,6 +265,7 @@ def _sum_parts(
         share=in_half / max(samples, 1),
         windows=windows,
         power=power,
+        rounded=rounded,
         error_power=error_power,
         effect=effect,
         count=float(sum(np.sum(floor.count) for floor in floors.values())),

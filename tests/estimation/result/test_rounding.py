@@ -1,0 +1,71 @@
+"""Intervals of fits to coarse encoders, and the covariance of rounding errors against those of rounded signals."""
+
+import numpy as np
+import pytest
+from scipy.signal import chirp, cont2discrete, dlsim
+
+import seaopt as so
+from seaopt.estimation.result.rounding import Rounding
+
+RATE_HZ, N, K_TAU = 500.0, 50.0, 0.07
+TRUTH = {"J_m": 4e-5, "b_r": 1e-3, "k_s": 300.0}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.15, 0.3])
+@pytest.mark.parametrize("steps", [0.2, 3.0, 40.0])
+def test_the_covariance_is_that_of_rounded_signals(steps, noise):
+    rng, q, t = np.random.default_rng(3), 0.7, np.arange(400) / 400
+    y = 0.5 * steps * q * np.sin(2 * np.pi * 2.3 * t)
+    influence = np.stack([np.sin(2 * np.pi * 2.3 * t), np.cos(5.0 * t), np.ones(400)])
+    moved = []
+    for phase in rng.uniform(0.0, q, 4000):
+        read = np.round((y + phase + noise * q * rng.normal(size=400)) / q) * q - phase
+        moved.append(influence @ (read - y))
+    rounding = Rounding.of(q, float(q * np.hypot(noise, 1.0 / np.sqrt(12.0))), 3)
+    assert rounding is not None
+    rounding.add(influence, y - q * np.round(y / q))
+    expected = rounding.multiply(influence @ influence.T)
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        np.cov(np.array(moved).T) / np.outer(size, size), expected / np.outer(size, size), atol=0.1
+    )
+
+
+def test_under_noise_of_half_a_step_nothing_is_left_of_it():
+    assert Rounding.of(1.0, float(np.hypot(0.51, 1.0 / np.sqrt(12.0))), 1) is None
+    assert Rounding.of(0.0, 0.1, 1) is None
+
+
+def fit_encoder(seed, steps):
+    """Return a fit of a held joint's motor angle, in so many steps over its swing."""
+    rng, t = np.random.default_rng(seed), np.arange(round(10.0 * RATE_HZ)) / RATE_HZ
+    current = chirp(t, 0.1, 10.0, 30.0, phi=rng.uniform(0, 360)) * rng.uniform(0.8, 1.2)
+    J_m, b_r, k_s = TRUTH.values()
+    a = np.array([[0.0, 1.0], [-k_s / N**2 / J_m, -b_r / J_m]])
+    held = cont2discrete((a, np.array([[0.0], [K_TAU / J_m]]), np.eye(2), np.zeros((2, 1))), 1.0 / RATE_HZ)
+    angle = dlsim((*held[:2], np.array([[1.0, 0.0]]), np.zeros((1, 1)), 1.0 / RATE_HZ), current)[1][:, 0]
+    step = 2.0 * np.max(np.abs(angle)) / steps
+    log = so.Log.from_arrays(time=t, I=current, theta_m=np.round((angle + rng.uniform(0, step)) / step) * step)
+    plant = so.plants.rotary(link="locked")
+    known = plant.defaults.update(K_tau=K_TAU, N=N, c_s=0.0, f_c=0.0)
+    start = known.update(**{name: 1.2 * value for name, value in TRUTH.items()}).free(*TRUTH)
+    return so.fit([so.Experiment(plant=plant, log=log, outputs=("theta_m",))], start)
+
+
+def test_ten_steps_of_an_encoder_leave_intervals_that_hold():
+    """Errors that follow the swing moved J_m and k_s by three times the std that white ones have, all fits met."""
+    fits = [fit_encoder(seed, 10) for seed in range(8)]
+    for name in ("J_m", "k_s"):
+        off = np.array([fit.parameters[name].value - TRUTH[name] for fit in fits])
+        z, of_noise = (
+            off / np.array([getattr(fit.parameters[name], std) for fit in fits]) for std in ("total_std", "std")
+        )
+        assert np.sqrt(np.mean(of_noise**2)) > 2.0
+        assert 0.5 < np.sqrt(np.mean(z**2)) < 1.4
+        assert np.all(np.abs(z) < 2.5)
+
+
+def test_a_fine_encoder_s_intervals_stay_as_they_were():
+    fit = fit_encoder(0, 400)
+    for name in TRUTH:
+        assert fit.parameters[name].total_std < 1.5 * fit.parameters[name].std
