@@ -227,7 +227,7 @@ def _weigh_hypotheses(
         )
         cause = _weigh(fit, candidate, refit.problem, refit.evaluation, before, colour, poor=False)
         if cause is not None:
-            yield replace(cause, refit=refit)
+            yield replace(cause, refit=refit, material=cause.material or not refit.at_minimum)
 
 
 def _is_near_noise(fit: Fit) -> bool:

@@ -27,7 +27,7 @@ from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_sticking
-from seaopt.estimation.solver.least_squares import FIRST_RADIUS, minimise
+from seaopt.estimation.solver.least_squares import FIRST_RADIUS, find_blocked, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
 from seaopt.estimation.solver.step_size import choose_first_steps
 from seaopt.parameters import ParameterSet
@@ -49,6 +49,7 @@ BASES = 3  # hypotheses, the best, beside which each other one is tried
 BACK = 1e-3  # of a residual's power, beyond the least yet, from which a refit is on its way back to it
 SLIGHT = 0.2  # of that: a step that may gain half as much ends a round
 NEAR = 1e-2  # squared standard deviations that may be left to the minimum
+LEFT = 1.0  # of them, from which a refit says only that something is missing, and not how far it moves the values
 
 
 @record(eq=False)
@@ -66,6 +67,13 @@ class Refit:
     def values(self) -> dict[str, float]:
         """The unknowns at the minimum."""
         return self.problem.unknowns.by_name(self.evaluation.z)
+
+    @property
+    def at_minimum(self) -> bool:
+        """Whether it has come so near to its minimum that its values are those that the hypothesis gives."""
+        unknowns = self.problem.unknowns
+        free = ~find_blocked(self.evaluation, unknowns.low, unknowns.high)
+        return self.evaluation.distance_squared(free) <= LEFT
 
     @property
     def frees(self) -> dict[str, float]:
@@ -165,7 +173,8 @@ class _Search:
             )
         if not refits:
             return refits
-        best = min(refits, key=lambda refit: refit.excess)
+        # Near noise likelihoods tell apart what hardly differs in excess.
+        best = min(refits, key=lambda refit: refit.excess if self.first > ASKS else -refit.gain)
         return [*(refit for refit in refits if refit is not best), _settle(best, best.evaluation)]
 
     def try_each(
@@ -190,7 +199,7 @@ class _Search:
                 continue
             self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
             try:
-                refit = _refit(change, problem, fitted, self.helps, self.base, self.end)
+                refit = _refit(change, problem, fitted, self.helps, self.base, self.end, self.first)
             except SeaoptError:  # what does not make a problem explains nothing
                 continue
             if refit is not None:
@@ -203,20 +212,21 @@ def _take_values(refit: Refit) -> ParameterSet:
 
 
 def _refit(
-    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, end: int
+    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, end: int, first: float
 ) -> Refit | None:
     """Return the minimum with a change, from the fit's, `base` the fit without any; None where it cannot be simulated.
 
     A search that takes less than `helps` of the residual's power in a round of iterations is given up, and so is one
-    that has come to `end`, a count of evaluations.
+    that has come to `end`, a count of evaluations. `first`: the fit's excess.
     """
     before = count_evaluations()
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
     for name in ("sigma", "substeps"):
         problem = problem.with_values(name, {e.name: getattr(e, name) for e in old.experiments})
-    start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
+    start = _choose_start(change, problem, old.unknowns.by_name(fitted.z), near=first <= ASKS)
     if not np.isfinite(start.cost):
         return None
+    problem = _rest(problem, start, old)
     evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
     at_fit = least = checked = _measure_powers(fitted)
     radius = FIRST_RADIUS
@@ -225,11 +235,11 @@ def _refit(
         if np.any(powers < HALF * checked):
             problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS, roughly=True)
             checked = powers
-        low, high, first = unknowns.low, unknowns.high, evaluation
-        near = NEAR if np.any(powers < HALF * at_fit) else max(NEAR, SLIGHT * helps * first.cost)
-        solution = minimise(problem, first, low, high, decrement=near, max_iterations=ROUND, first_radius=radius)
+        low, high, begun = unknowns.low, unknowns.high, evaluation
+        near = NEAR if np.any(powers < HALF * at_fit) else max(NEAR, SLIGHT * helps * begun.cost)
+        solution = minimise(problem, begun, low, high, decrement=near, max_iterations=ROUND, first_radius=radius)
         evaluation = solution.evaluation
-        if evaluation is first and solution.status == "max_iterations" and radius == FIRST_RADIUS:
+        if evaluation is begun and solution.status == "max_iterations" and radius == FIRST_RADIUS:
             radius = CLOSE  # every step went too far
             continue
         if not np.isfinite(evaluation.cost):
@@ -267,15 +277,37 @@ def _settle(refit: Refit, start: Evaluation) -> Refit:
     return replace(refit, evaluation=evaluation, excess=excess, gain=gain)
 
 
-def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float]) -> Evaluation:
-    """Return the evaluation at the fit's values and the best start of what is added."""
+def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float], *, near: bool) -> Evaluation:
+    """Return the evaluation at the fit's values and the best start of what is added: near noise that from which a step
+    of all else is to gain the most, for what a fit has in place of an effect is at odds with most of it.
+    """
     unknowns, evaluations = problem.unknowns, list[Evaluation]()
     delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
     for start in change.starts:
         z = unknowns.start_from({**fitted, **start})
         z[delays] -= change.hypotheses[-1].lag(start)
         evaluations.append(problem.evaluate(np.clip(z, unknowns.low, unknowns.high)))
-    return min(evaluations, key=lambda evaluation: evaluation.cost)
+    others = np.array([name in fitted for name in unknowns.names])
+
+    def reach(evaluation: Evaluation) -> float:
+        if not near or not np.isfinite(evaluation.cost):
+            return evaluation.cost
+        free = others & ~find_blocked(evaluation, unknowns.low, unknowns.high)
+        return evaluation.cost - 0.5 * evaluation.distance_squared(free)
+
+    return min(evaluations, key=reach)
+
+
+def _rest(problem: FitProblem, start: Evaluation, old: FitProblem) -> FitProblem:
+    """Return a problem whose joints start as the fit has them, at rest: no slope tells with which speed, or with which
+    state of what is added. `old`: the problem of the fit.
+    """
+    places, unknowns = problem.find_stopped(), problem.unknowns
+    if not places or np.any(start.z[places] != 0.0):
+        return problem
+    before = dict(zip(old.unknowns.names, old.unknowns.low == old.unknowns.high, strict=True))
+    places += [i for i, name in enumerate(unknowns.names) if i >= unknowns.shared and before.get(name, True)]
+    return replace(problem, unknowns=unknowns.bound(places, start.z[places], start.z[places]))
 
 
 @np.errstate(all="ignore")  # a run that overflows, where it is held out alone, has no finite excess
@@ -325,8 +357,7 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
         refit
         for refit in refits
         if refit.excess <= max(REMOVED, NEARLY * first)
-        and _takes_half(first, refit.excess)
-        and (first > ASKS or refit.gain > CHANCE * colour)
+        and (_takes_half(first, refit.excess) if first > ASKS else refit.gain > CHANCE * colour)
         and (refit in single or (best_single > ASKS and _takes_half(best_single, refit.excess)))
     ]
     least = min((refit.excess for refit in able), default=np.inf)

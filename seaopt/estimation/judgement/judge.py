@@ -138,9 +138,11 @@ def judge(
         )
         named = list(_name_causes(fit, causes, suspects))
         told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)
-        refits = [cause.refit for cause in _list_rivals(causes)]
-        if refits and all(refits) and told:
-            # Both amplitudes and the hypotheses tell how far the values are off: the interval has all of them.
+        rivals = _list_rivals(causes)
+        refits = [cause.refit for cause in rivals]
+        if refits and all(refits) and (told or not any(cause.material for cause in rivals)):
+            # Hypotheses tell how far the values are off, of a high excess those of logs of both amplitudes: the
+            # interval has all of them.
             fit, findings = _reach(fit, findings, error, *(refit.values for refit in refits if refit is not None))
             named = [replace(each, severity="warning") if each.kind == "cause" else each for each in named]
         findings += named
