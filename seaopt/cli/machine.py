@@ -20,8 +20,9 @@ from seaopt.control import Controller, ControllerSpec, ScheduledController
 from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
-from seaopt.machine import Acceptance, BringUp, accept, bring_up, write_bring_up
+from seaopt.machine import Acceptance, BringUp, Stage, accept, bring_up
 from seaopt.machine.acceptance import take_ranges
+from seaopt.machine.bringup_files import write_stage
 from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
 from seaopt.machine.stepped import Source
@@ -173,7 +174,15 @@ def plan_bring_up(
         assert isinstance(judged, Certificate)
         return judged
 
+    target = folder / BRING_UP
     with show_progress(errors, "planning the stages", errors.say) as tell:
+
+        def keep_stage(stage: Stage) -> None:
+            # What an earlier run planned is not said of these stages.
+            (target / "bringup.json").unlink(missing_ok=True)
+            write_stage(stage, target / stage.name, tare=zeroing)
+            tell(f"wrote {target / stage.name}")
+
         plan = bring_up(
             controller,
             session.problem.certified_plants(),
@@ -184,10 +193,10 @@ def plan_bring_up(
             limits=_parse_limits(limits),
             tune_stage=tune_stage,
             certify_stage=certify_stage,
+            keep_stage=keep_stage,
             progress=tell,
         )
-    target = folder / BRING_UP
-    write_bring_up(plan, target, tare=zeroing)
+    write_json(target / "bringup.json", plan.to_dict())
     page = write_bring_up_page(
         plan,
         target / "bringup.html",

@@ -145,6 +145,7 @@ def bring_up(
     certificate: Certificate | None = None,
     tune_stage: Callable[[ControllerSpec], Controller] | None = None,
     certify_stage: Callable[[Controller], Certificate] | None = None,
+    keep_stage: Callable[[Stage], object] | None = None,
     seed: int = SEED,
     progress: Progress = ignore,
 ) -> BringUp:
@@ -174,6 +175,8 @@ def bring_up(
         Of the full law, where there is one.
     tune_stage, certify_stage : callable, optional
         How a stage's law is tuned and certified, where more than plants and ranges count.
+    keep_stage : callable, optional
+        Called with each stage as soon as it is planned: the next may take minutes.
     seed : int
         Of phases and draws.
     progress : callable, optional
@@ -221,15 +224,24 @@ def bring_up(
     options: dict[str, Any] = {"share": share, "bias": bias, "limits": dict(limits or {}), "seed": seed}
     draws = list_draws(controller, uncertainty, ranges, DRAWS, seed)
     stages: list[Stage] = []
+
+    def keep(stage: Stage) -> None:
+        stages.append(stage)
+        if keep_stage is not None:
+            keep_stage(stage)
+
     count = len(fractions) + 1
     for number, fraction in enumerate(sorted(fractions), start=1):
-        progress(f"stage {number} of {count}", (number - 1) / count)
-        law, judged, note = _find_stage(controller, fraction, tuning, certifying)
+
+        def tell(text: str, number: int = number) -> None:
+            progress(f"stage {number} of {count}, {text}", (number - 1) / count)
+
+        law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell)
         part = options | {"share": share * fraction}
-        stages.append(_make_stage(f"stage_{number}", law, judged, note, draws, part))
-    progress(f"stage {count} of {count}", 1.0 - 1.0 / count)
+        keep(_make_stage(f"stage_{number}", law, judged, note, draws, part))
+    progress(f"stage {count} of {count}, certifying the law itself", 1.0 - 1.0 / count)
     judged = certifying(controller) if certificate is None else certificate
-    stages.append(_make_stage("full", controller, judged, "", draws, options))
+    keep(_make_stage("full", controller, judged, "", draws, options))
     return BringUp(stages=tuple(stages))
 
 
@@ -238,6 +250,7 @@ def _find_stage(
     fraction: float,
     tuning: Callable[[ControllerSpec], Controller],
     certifying: Callable[[Controller], Certificate],
+    tell: Callable[[str], None],
 ) -> tuple[Controller, Certificate, str]:
     """Return the law of a stage, its certificate, and in what it is another one than planned."""
     spec = controller.spec
@@ -250,9 +263,11 @@ def _find_stage(
         if isinstance(spec.min_sensitivity_bandwidth_hz, float | int) and spec.min_sensitivity_bandwidth_hz:
             changes["min_sensitivity_bandwidth_hz"] = spec.min_sensitivity_bandwidth_hz * band / spec.bandwidth_hz
         try:
+            tell(f"tuning at {band:.3g} Hz")
             law = tuning(replace(spec, **changes))
             if not law.met:
                 continue
+            tell(f"certifying at {band:.3g} Hz")
             judged = certifying(law)
         except SeaoptError:
             continue
@@ -270,6 +285,7 @@ def _find_stage(
     note = (
         f"the full law with {100.0 * fraction:g} % of its effort: none near {fraction:g} of its bandwidth is certified"
     )
+    tell(f"certifying with {100.0 * fraction:g} % of the effort")
     return lower, certifying(lower), note
 
 

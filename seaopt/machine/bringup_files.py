@@ -74,11 +74,13 @@ def write_bring_up(plan: BringUp, folder: Path | str, *, tare: Tare | None = Non
     target = Path(folder)
     files = [write_json(target / "bringup.json", plan.to_dict())]
     for stage in plan.stages:
-        files += _write_stage(stage, target / stage.name, tare)
+        files += write_stage(stage, target / stage.name, tare=tare)
     return tuple(files)
 
 
-def _write_stage(stage: Stage, folder: Path, tare: Tare | None) -> list[Path]:
+def write_stage(stage: Stage, folder: Path | str, *, tare: Tare | None = None) -> list[Path]:
+    """Write the files of one stage into its own folder, as `write_bring_up` does; return them."""
+    folder = Path(folder)
     excitation, unit = stage.excitation, stage.controller.command.reference_unit
     reference = excitation.reference
     time = excitation.sample_time_s * np.arange(reference.size)

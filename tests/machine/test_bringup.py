@@ -89,15 +89,18 @@ def test_where_no_slower_law_is_certified_it_is_the_same_with_less_effort(contro
     def refuse(spec):
         raise so.SeaoptError("none")
 
+    kept = []
     plan = so.bring_up(
         controller,
         {"stand": so.plants.high_impedance()},
         so.plants.thor(),
         fractions=(0.25,),
         tune_stage=refuse,
+        keep_stage=lambda stage: kept.append(stage.name),
         certify_stage=lambda law: so.certify(law, {"stand": so.plants.high_impedance()}, so.plants.thor(), samples=5),
     )
     stage = plan.stages[0]
+    assert kept == [each.name for each in plan.stages]
     assert stage.controller.command_limit == 2.25 and "effort" in stage.note
     assert np.array_equal(stage.controller.law.a, controller.law.a)
 
