@@ -27,6 +27,7 @@ from seaopt.plants.actuator import (
     check_choices,
     make_plant,
 )
+from seaopt.plants.friction import let_stick
 from seaopt.plants.motor import effects
 from seaopt.plants.parts import INSIDE, PARTS, SHARPNESS, Part, check_parts
 from seaopt.plants.plant import Plant
@@ -149,6 +150,7 @@ def rotary(
     spring: Spring = "link2",
     parts: Sequence[Part] = (),
     external: bool = False,
+    sticks: bool = False,
 ) -> Plant:
     r"""Return a rotary series elastic actuator: motor, gearbox, spring and link about one axis.
 
@@ -169,6 +171,8 @@ def rotary(
         `seaopt.plants.parts` but the screw's own mode.
     external : bool
         Whether a torque tau_e (N m) on the link is an input of its own, zero where a log leaves it out.
+    sticks : bool
+        Whether friction jumps at rest, as `seaopt.plants.let_stick` has it, and is not smoothed.
 
     Returns
     -------
@@ -213,7 +217,8 @@ def rotary(
     if "screw_mode" in parts:
         raise PlantError('part "screw_mode" is the axial mode of a ball screw; a gear\'s elasticity is part of k_s')
     name = f"rotary({link}, {drive})" if (link, drive) != ("free", "unlumped") else "rotary"
-    return _actuator(name, _Build(link=link, drive=drive, spring=spring, parts=tuple(parts), external=external))
+    plant = _actuator(name, _Build(link=link, drive=drive, spring=spring, parts=tuple(parts), external=external))
+    return let_stick(plant) if sticks else plant
 
 
 def _actuator(name: str, build: _Build) -> Plant:

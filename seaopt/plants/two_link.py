@@ -26,6 +26,7 @@ from seaopt.plants.actuator import (
     check_choices,
     make_plant,
 )
+from seaopt.plants.friction import let_stick
 from seaopt.plants.parts import PARTS, Part
 from seaopt.plants.plant import Plant
 from seaopt.plants.published import ACTUATOR, GRAVITY, link_mass, pendulum
@@ -227,6 +228,7 @@ def two_link(
     drive: Drive = "unlumped",
     spring: Spring = "link1",
     parts: Sequence[Part] = (),
+    sticks: bool = False,
 ) -> Plant:
     r"""Return the general plant: an actuator between two links, each fixed, a free mass or a pendulum.
 
@@ -241,6 +243,8 @@ def two_link(
         Between housing and link 1 (the paper), or between ball nut and link 2 (its future work).
     parts : sequence of str
         Effects of a real actuator to add; see `seaopt.plants.parts`.
+    sticks : bool
+        Whether friction jumps at rest, as `seaopt.plants.let_stick` has it, and is not smoothed.
 
     Returns
     -------
@@ -270,15 +274,18 @@ def two_link(
     >>> list(plant.states)
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
     """
-    return _build_plant(f"two_link({link1}, {link2}, ", (link1, link2), drive, spring, parts, external=True)
+    plant = _build_plant(f"two_link({link1}, {link2}, ", (link1, link2), drive, spring, parts, external=True)
+    return let_stick(plant) if sticks else plant
 
 
-def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: Sequence[Part] = ()) -> Plant:
+def high_impedance(
+    drive: Drive = "unlumped", spring: Spring = "link1", parts: Sequence[Part] = (), sticks: bool = False
+) -> Plant:
     r"""Return the test stand: both links fixed (Orekhov et al. 2015, Fig. 5 and (6)-(15)).
 
     Parameters
     ----------
-    drive, spring, parts
+    drive, spring, parts, sticks
         As in `two_link`.
 
     Returns
@@ -303,15 +310,18 @@ def high_impedance(drive: Drive = "unlumped", spring: Spring = "link1", parts: S
     >>> bool(abs(model.dcgain()[0, 0] - 240.33) < 0.01)  # N/A: K_tau / r
     True
     """
-    return _build_plant("high_impedance(", ("fixed", "fixed"), drive, spring, parts)
+    plant = _build_plant("high_impedance(", ("fixed", "fixed"), drive, spring, parts)
+    return let_stick(plant) if sticks else plant
 
 
-def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Sequence[Part] = ()) -> Plant:
+def moving_output(
+    drive: Drive = "unlumped", spring: Spring = "link1", parts: Sequence[Part] = (), sticks: bool = False
+) -> Plant:
     r"""Return the swing phase: link 1 fixed, a pendulum on link 2 (Orekhov et al. 2015, Fig. 8, Sec. III-E).
 
     Parameters
     ----------
-    drive, spring, parts
+    drive, spring, parts, sticks
         As in `two_link`.
 
     Returns
@@ -329,4 +339,5 @@ def moving_output(drive: Drive = "unlumped", spring: Spring = "link1", parts: Se
     >>> list(moving_output().outputs)
     ['F1', 'F2', 'q', 'phi', 'x_2']
     """
-    return _build_plant("moving_output(", ("fixed", "pendulum"), drive, spring, parts, suffixes=("1", ""))
+    plant = _build_plant("moving_output(", ("fixed", "pendulum"), drive, spring, parts, suffixes=("1", ""))
+    return let_stick(plant) if sticks else plant

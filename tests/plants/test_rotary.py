@@ -319,3 +319,10 @@ def test_a_torque_on_a_link_whose_motor_sticks_twists_the_spring():
     np.testing.assert_allclose(run["tau_s"], -params["k_s"].value * run["theta_l"], atol=1e-4)
     without = so.simulate(knee, params, so.Log.from_arrays(time=log.time, I=log["I"]), initial_state={})
     assert np.max(np.abs(without["theta_l"])) == 0.0
+
+
+def test_a_plant_is_made_to_stick_by_the_option_that_a_problem_file_has():
+    for make in (so.plants.rotary, so.plants.high_impedance, so.plants.moving_output, so.plants.two_link):
+        assert make(sticks=True).sticks and not make().sticks
+    with pytest.raises(PlantError, match="sticks by itself"):
+        so.plants.rotary(parts=["lugre"], sticks=True)
