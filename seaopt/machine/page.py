@@ -11,7 +11,7 @@ from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.differences import Difference, Differences
 from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Cause, Replay
-from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, Judged, Measured, Response
+from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, Judged, Measured, Response
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -101,9 +101,11 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     response, differences = result.response, result.differences
     if response is not None:
         limited = [row for row in response.judged if row.limit is not None]
-        confirmed = sum(row.outcome == "confirmed" for row in limited)
-        parts.append(f"{confirmed} of {len(limited)} limits confirmed")
-        reasons += [Reason(what=_say_judged(row, response)) for row in limited if row.outcome != "confirmed"]
+        counts = {outcome: sum(row.outcome == outcome for row in limited) for outcome in OUTCOMES}
+        parts.append(f"{counts['confirmed']} of {len(limited)} limits confirmed, {counts['refuted']} refuted")
+        reasons += [Reason(what=_say_refuted(row)) for row in limited if row.outcome == "refuted"]
+        if counts["undecided"]:
+            reasons.append(Reason(what=f"the log does not decide {_say_undecided(response)}"))
     if differences is not None and not differences.inside:
         parts.append("the machine is not one of those certified")
         best = "its response is another one" if not differences.found else say_difference(differences.found[0])
@@ -113,27 +115,29 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons))
 
 
-def _say_judged(row: Judged, response: Response) -> str:
-    unit = unit_after(row.unit)
+def _say_refuted(row: Judged) -> str:
     if row.name == "stability":
-        return f"stability is {row.outcome}{_say_lines(response)}"
-    limit = f"{row.name} {row.sense} {format_number(row.limit)}{unit} is {row.outcome}"
+        return "stability is refuted"
+    limit = f"{row.name} {row.sense} {format_number(row.limit)}{unit_after(row.unit)} is refuted"
     at = "" if row.where_hz is None else f" at {format_number(row.where_hz, 3)} Hz"
-    found = f"{format_number(row.value, 3)} ({_show_interval(row)}){at}"
+    return f"{limit}: {format_number(row.value, 3)} ({_show_interval(row)}){at}"
+
+
+def _say_undecided(response: Response) -> str:
+    """Return of which limits a log does not say enough, and what to record so that it does."""
+    rows = [row for row in response.judged if row.limit is not None and row.outcome == "undecided"]
+    record: list[str] = []
     if response.needs_phases:
-        return f"{limit}: {found}; with dry friction record six sets of random phases"
-    more = "" if row.periods is None else f"; {row.periods} periods in all would decide"
-    return f"{limit}: {found}{more}{_say_lines(response) if row.outcome == 'undecided' else ''}"
-
-
-def _say_lines(response: Response) -> str:
-    """Return which lines are to be played, where those of the log are too few."""
-    if response.needs_lines is None:
-        return ""
-    low, high = (format_number(edge, 3) for edge in response.needs_lines)
-    return (
-        f"; play at least {FEWEST_LINES} lines from {low} to {high} Hz, each at most {CLOSEST:g} times the one before"
-    )
+        record.append(f"{LEAST_PHASES} sets of random phases, which dry friction asks for")
+    if response.needs_lines is not None:
+        low, high = (format_number(edge, 3) for edge in response.needs_lines)
+        record.append(
+            f"at least {FEWEST_LINES} lines from {low} to {high} Hz, each at most {CLOSEST:g} times the one before"
+        )
+    if periods := max((row.periods or 0 for row in rows), default=0):
+        record.append(f"{periods} periods in all")
+    wanted = join_words(record) or "more periods, or a larger reference"
+    return f"{join_words([row.name for row in rows])}: record {wanted}"
 
 
 def _show_interval(row: Judged) -> str:
@@ -189,8 +193,8 @@ def _describe_response(response: Response, left_out: Mapping[str, str]) -> Secti
     ]
     if response.at_amplitude_only:
         remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
-    if response.needs_lines is not None:
-        remarks.append(f"Nothing is confirmed{_say_lines(response)}.")
+    if any(row.outcome == "undecided" for row in response.judged if row.limit is not None):
+        remarks.append(f"Undecided is no doubt about the machine: the log does not decide {_say_undecided(response)}.")
     remarks += [f"Left out: {text}" for text in left_out.values()]
     tables = (Table(head=head, rows=rows, align="<<>>>>>>", optional=("periods needed",)),)
     return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks))

@@ -130,7 +130,7 @@ def test_lines_that_miss_the_crossover_confirm_nothing_and_the_row_says_which_to
     assert np.isclose(low, crossover / 4.0) and np.isclose(high, 2.0 * crossover)
     outcomes = {row.name: row.outcome for row in result.response.judged}
     assert "confirmed" not in outcomes.values() and outcomes["stability"] == "undecided" and not result.met
-    assert "play at least 8 lines" in " ".join(repr(result).split())
+    assert "record at least 8 lines" in " ".join(repr(result).split())
 
 
 def test_phases_are_told_apart_and_the_first_period_of_each_is_left_out(controller, bench):
@@ -207,8 +207,11 @@ def test_with_dry_friction_the_machine_is_predicted_at_the_amplitude_that_was_pl
 def test_with_dry_friction_fewer_than_six_sets_of_phases_confirm_nothing(dry):
     bench, reference = dry
     log = bench.log(replace(Machine(), coulomb=FRICTION, smoothing=5e-3), reference[:8000])
-    response = so.accept(bench.controller, [log]).response
+    result = so.accept(bench.controller, [log])
+    response, text = result.response, " ".join(repr(result).split())
     assert response.needs_phases and {row.outcome for row in response.judged} == {"undecided"}
+    assert "0 of 5 limits confirmed, 0 refuted" in text
+    assert "the log does not decide stability, Ms, Mt, reference peak and bandwidth: record 6 sets of random" in text
 
 
 def test_margins_of_a_loop_that_crosses_a_gain_of_one_three_times(controller):
