@@ -143,6 +143,7 @@ def fit(
         if diagnostics:
             judged = judge(result, alternatives, judging, validation, evaluations=evaluations)
             result = _name_guesses(judged, named, params)
+    result = replace(result, validation=tuple(validation), holdout=holdout)
     if sharp:
         result = replace(result, findings=order_findings((*result.findings, *map(find_sharp_friction, sharp))))
     progress(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}", 1.0)

@@ -473,6 +473,7 @@ def certify_problem(
         As in `seaopt.certify`.
     """
     table, plants, measured = problem.robustness, problem.certified_plants(), problem.measure_responses(source)
+    source, unread_logs = _add_logs(problem, source)
     if isinstance(controller, Controller) and problem.designs_on_response:
         if not plants:
             return certify(controller, plants, source, seed=table.seed, measured=measured)
@@ -501,11 +502,25 @@ def certify_problem(
         executor=executor,
         progress=progress,
     )
-    unread = [name for name in problem.sensors.names if name not in read]
-    if not unread or isinstance(certificate, ScheduleCertificate):
+    if isinstance(certificate, ScheduleCertificate):
         return certificate
-    note = f"errors of {', '.join(unread)} in sensors are in no run: the law reads {', '.join(read)}"
-    return replace(certificate, remarks=(*certificate.remarks, note))
+    unread, notes = [name for name in problem.sensors.names if name not in read], list(unread_logs)
+    if unread:
+        notes.append(f"errors of {', '.join(unread)} in sensors are in no run: the law reads {', '.join(read)}")
+    return replace(certificate, remarks=(*certificate.remarks, *notes)) if notes else certificate
+
+
+def _add_logs(problem: Problem, source: Fit | ParameterSet) -> tuple[Fit | ParameterSet, tuple[str, ...]]:
+    """Return a fit that was read from a file with its logs, which judge the law; and why they cannot be read."""
+    if not isinstance(source, Fit) or source.experiments:
+        return source, ()
+    try:
+        every = problem.experiments()
+    except SeaoptError as error:
+        return source, (f"the fit's logs do not judge the law, for they cannot be read: {error}",)
+    fitted = problem.choose_fitted(every)
+    scored = tuple(experiment for experiment in every if experiment not in fitted)
+    return replace(source, experiments=fitted, validation=scored, holdout=problem.table.fit.holdout), ()
 
 
 class Stages:

@@ -111,8 +111,10 @@ class Fit(Result, Worded):
         What the model may lack, as it was tried, the best first; empty where the residuals do not ask for it.
     silent : tuple of SilentEffect
         What the logs cannot tell, and the parameters that it touches.
-    experiments : tuple of Experiment
-        The data; empty when read from a file.
+    experiments, validation : tuple of Experiment
+        The data that were fitted, and those that were not; empty when read from a file.
+    holdout : float
+        The last fraction of each log, that was not fitted; 0 when read from a file.
     minimum : Minimum or None
         The problem and its unknowns, from which refits start; None when read from a file.
     """
@@ -155,6 +157,8 @@ class Fit(Result, Worded):
     delay_covariance: Covariance | None = field(default=None, repr=False)
     model_covariance: Covariance | None = field(default=None, repr=False)
     experiments: tuple[Experiment, ...] = field(default=(), repr=False)
+    validation: tuple[Experiment, ...] = field(default=(), repr=False)
+    holdout: float = field(default=0.0, repr=False)
     minimum: Minimum | None = field(default=None, repr=False)
 
     @property

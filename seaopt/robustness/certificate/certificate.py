@@ -43,6 +43,7 @@ from seaopt.robustness.certificate.simulated import (
 )
 from seaopt.robustness.uncertainty.draws import Plants, Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
+from seaopt.robustness.uncertainty.logs import LogVerdict
 from seaopt.robustness.uncertainty.plant_margins import PlantMargins
 from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.limit_cycles import FoundCycle
@@ -105,6 +106,8 @@ class Certificate(Result, Worded):
         The same over draws, of those models for which it is shown at the nominal parameters.
     impedance : CertifiedImpedance or None
         What the controller's outer loop renders, where it has one.
+    logs : tuple of LogVerdict
+        What the fit's logs say of the loop; empty without a fit, or where none has what the law reads.
     constrained : ConstrainedRuns or None
         Of predictive control: runs with its limits active; all else is of its linear region.
     place : (str, float) or None
@@ -136,6 +139,7 @@ class Certificate(Result, Worded):
     compensation: Mapping[str, CompensationMargin] = field(default_factory=dict[str, CompensationMargin])
     compensation_draws: Mapping[str, MarginDraws] = field(default_factory=dict[str, MarginDraws])
     impedance: CertifiedImpedance | None = None
+    logs: tuple[LogVerdict, ...] = ()
     constrained: ConstrainedRuns | None = None
     place: tuple[str, float] | None = None
     remarks: tuple[str, ...] = ()
@@ -269,6 +273,7 @@ class Certificate(Result, Worded):
             "remarks": list(self.remarks),
             "notes": list(self.notes),
             "impedance": None if self.impedance is None else self.impedance.to_dict(),
+            "logs": to_content(self.logs),
             "constrained": None if self.constrained is None else self.constrained.to_dict(),
             "passivity": None if self.simulated is None else self.simulated.passivity_dict(),
             "steps": self.steps.to_dict() if isinstance(self.steps, Verification) else {"left_out": self.steps},

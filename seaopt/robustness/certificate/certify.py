@@ -45,7 +45,7 @@ from seaopt.robustness.certificate.compensation import COMPENSATION
 from seaopt.robustness.certificate.constrained import CONSTRAINED, linear_controller
 from seaopt.robustness.certificate.friction import FRICTION
 from seaopt.robustness.certificate.impedance import IMPEDANCE
-from seaopt.robustness.certificate.limits import MEASURED, NOMINAL, measured_requirements
+from seaopt.robustness.certificate.limits import LOGS, MEASURED, NOMINAL, measured_requirements
 from seaopt.robustness.certificate.measured_draws import DRAWS
 from seaopt.robustness.certificate.requirement import Requirement
 from seaopt.robustness.certificate.scheduled import (
@@ -59,7 +59,7 @@ from seaopt.robustness.certificate.simulated import SIMULATIONS, STEPS
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.verification.verification import check_sensors
 
-CHECKS = (NOMINAL, DRAWS, FRICTION, IMPEDANCE, COMPENSATION, MEASURED, STEPS, SIMULATIONS, CONSTRAINED)
+CHECKS = (NOMINAL, DRAWS, FRICTION, IMPEDANCE, COMPENSATION, MEASURED, LOGS, STEPS, SIMULATIONS, CONSTRAINED)
 SCHEDULE_CHECKS = (STRETCHES, JOINT_DRAWS, SWEEPS)  # of a schedule as a whole, after those at each of its values
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
 
@@ -133,7 +133,8 @@ def certify(
         with friction is certified twice: sliding, where its friction is flattest, and stuck, where it is steepest.
         Empty for a controller designed on a measured response, which is certified on `measured` alone.
     parameters : Fit or ParameterSet
-        A fit's joint distribution, truncated to the bounds; or values, with the prior_std of those that have one.
+        A fit's joint distribution, truncated to the bounds; or values, with the prior_std of those that have one. The
+        logs of a fit judge the law too: none may show an Ms over the limit, or a loop that is unstable.
     ranges : mapping of name to (low, high), optional
         Drawn uniformly instead: parameters, but for what a schedule is over; conditions, which are an angle to
         linearise at (phi, rad) and delay_s, seconds besides the controller's; and screw_mode_hz, where the screw's mode

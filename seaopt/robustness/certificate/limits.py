@@ -1,4 +1,6 @@
-"""Limits of a law's figures: on the design plant, on every plant at the nominal parameters, on measured points."""
+"""Limits of a law's figures: on the design plant, on every plant at the nominal parameters, on measured points and on
+the logs of the fit.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +18,7 @@ from seaopt.control.loops.measured.figures import measure_discs
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY
+from seaopt.estimation import Experiment, Fit
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -30,12 +33,16 @@ from seaopt.robustness.certificate.requirement import (
     UNSTABLE_LOOP,
     Requirement,
     Spot,
+    require_at_most,
 )
+from seaopt.robustness.uncertainty.logs import GRACE, judge_log
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES
 
 PASSIVE = "passive_band_hz"
+LOG_SENSITIVITY = "log_sensitivity"
+LOG_SECONDS = 0.02  # that the logs of a fit take as a rule
 AMPLITUDES = 9  # looked at for the remark on bandwidth
 
 
@@ -76,7 +83,46 @@ def measure_responses(survey: Survey, _: Progress) -> Evidence:
     return Evidence(requirements=rows, remarks=tuple(_remark_measured(controller, measured)))
 
 
+def judge_logs(survey: Survey, _: Progress) -> Evidence:
+    """Judge the law on every log of the fit that is of one of its plants, and was taken where a schedule stands."""
+    controller, fit = survey.cases.controller, survey.source
+    limit = controller.spec.level("max_sensitivity")
+    if limit is None or not isinstance(fit, Fit):
+        return Evidence()
+    names = {plant.name for plant in survey.cases.models.values()}
+    logs = [each for each in (*fit.experiments, *fit.validation) if each.plant.name in names]
+    if survey.place is not None:
+        logs = [each for each in logs if np.isclose(_find_log_place(survey.place[0], fit, each), survey.place[1])]
+    found = [judge_log(controller, fit, experiment, limit) for experiment in logs]
+    verdicts = tuple(verdict for of_log, _ in found for verdict in of_log)
+    rows = (
+        require_at_most(
+            LOG_SENSITIVITY,
+            verdict.ms_least,
+            limit * (1.0 + GRACE),
+            plant=f"log:{verdict.experiment}",
+            text=verdict.text,
+        )
+        for verdict in verdicts
+    )
+    return Evidence(
+        requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remark for _, remark in found if remark)
+    )
+
+
+def _find_log_place(over: str, fit: Fit, experiment: Experiment) -> float:
+    """Return where a schedule's variable stood in a log: a parameter at its value, a state at rest."""
+    values = experiment.apply_own(fit.parameters)
+    known = values if over in values else experiment.plant.defaults
+    return known[over].value if over in known else 0.0
+
+
 NOMINAL = Check(measure=measure_nominal)
+LOGS = Check(
+    measure=judge_logs,
+    seconds=lambda _: LOG_SECONDS,
+    applies=lambda survey: bool(survey.cases.models) and isinstance(survey.source, Fit),
+)
 MEASURED = Check(measure=measure_responses, applies=lambda survey: bool(survey.measured))
 
 

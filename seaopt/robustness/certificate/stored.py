@@ -35,6 +35,7 @@ from seaopt.robustness.certificate.scheduled import ScheduleCertificate
 from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
 from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
+from seaopt.robustness.uncertainty.logs import LogVerdict
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
 from seaopt.robustness.verification.impedance_steps import ImpedanceStep
@@ -108,6 +109,7 @@ class StoredCertificate:
     friction: dict[str, StoredFriction] = field(default_factory=dict[str, StoredFriction])
     impedance: StoredImpedance | None = None
     compensation: dict[str, StoredFriction] = field(default_factory=dict[str, StoredFriction])
+    logs: tuple[LogVerdict, ...] = ()
     constrained: ConstrainedRuns | None = None
     schedule: None = None
 
@@ -207,6 +209,7 @@ def build_certificate(
             compensation=find_nominal_compensation(controller, models, parameters),
             compensation_draws={name: each.draws for name, each in stored.compensation.items() if each.draws},
             impedance=certify_impedance(controller, models, parameters, impedance.draws, impedance.steps),
+            logs=stored.logs,
             constrained=stored.constrained,
             remarks=stored.remarks,
         )

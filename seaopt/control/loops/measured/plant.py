@@ -97,8 +97,8 @@ def sample_measured(
     end, folded = float(np.abs(centre[-1]) + radius[-1]), 0.0
     turned = centre * np.exp(-2j * np.pi * f * late)
     if not (same and abs(samples - round(samples)) < WHOLE):
-        own_clock, old = Clock(period=sample_time_s), _hold(f, clock)
-        ratio = _hold(f, own_clock) / old
+        own_clock, old = Clock(period=sample_time_s), hold_response(f, clock)
+        ratio = hold_response(f, own_clock) / old
         plain = end / float(np.abs(old[-1]))
         extra = _fold(f, own_clock, plain, f[-1])
         radius = (radius + _fold(f, clock, plain, f[-1])) * np.abs(ratio) + extra
@@ -132,7 +132,7 @@ def _check_rest(
         )
 
 
-def _hold(f: Float[np.ndarray, " m"], clock: Clock) -> Complex[np.ndarray, " m"]:
+def hold_response(f: Float[np.ndarray, " m"], clock: Clock) -> Complex[np.ndarray, " m"]:
     """Return the response of the hold alone."""
     if clock.hold == "first":
         return np.sinc(f * clock.period) ** 2 + 0j
@@ -144,6 +144,6 @@ def _fold(f: Float[np.ndarray, " m"], clock: Clock, end: float, end_hz: float) -
     out = np.zeros(f.size)
     for k in (*range(-FOLDED, 0), *range(1, FOLDED + 1)):
         image = np.abs(f + k / clock.period)
-        out += end * np.minimum(end_hz / image, 1.0) * np.abs(_hold(image, clock))
+        out += end * np.minimum(end_hz / image, 1.0) * np.abs(hold_response(image, clock))
     # Beyond: end_hz T/k of the plant and 1/(pi k) of the hold, on both sides.
     return out + 2.0 * end * end_hz * clock.period / (np.pi * FOLDED)

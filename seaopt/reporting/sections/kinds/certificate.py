@@ -47,6 +47,7 @@ REMEDIES = {
     "friction_compensation": 'from = "reference", a larger speed or a smaller fraction in compensate of [controller]',
     "constrained_failure_probability": "more constrained_runs in [robustness]",
     "min_schedule_rate": "a smaller min_rate in [controller.schedule], or a higher bandwidth_hz",
+    "log_sensitivity": "seaopt fit --explain, which names what the model may lack, or a lower bandwidth_hz",
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
 }
 
@@ -162,6 +163,7 @@ def describe(certificate: Certificate) -> list[Section]:
             ),
         ),
         *(_describe_uncertainty(certificate) if certificate.models else ()),
+        *_describe_logs(certificate),
         *_describe_draws(certificate),
         *list_notes("the certificate", [*certificate.notes, *left_out]),
     ]
@@ -210,6 +212,47 @@ def _describe_simulation(certificate: Certificate) -> Iterator[str]:
         yield from summarise_findings(certificate.simulated)
     if certificate.impedance is not None:
         yield from (f"impedance: {line}" for line in certificate.impedance.lines())
+
+
+def _describe_logs(certificate: Certificate) -> Iterator[Section]:
+    """Yield what the fit's logs say of the loop."""
+    rows = tuple(
+        (
+            verdict.experiment,
+            verdict.samples,
+            verdict.outcome,
+            format_number(verdict.ms, 3),
+            format_number(verdict.ms_predicted, 3),
+            format_number(verdict.ms_hz, 3),
+            format_number(verdict.ms_least, 3),
+            format_band(verdict.band_hz),
+            f"{verdict.amplitude:.3g} {verdict.unit}" + (", and at that alone" if verdict.at_amplitude else ""),
+        )
+        for verdict in certificate.logs
+    )
+    head = (
+        "log",
+        "samples",
+        "says",
+        "Ms measured",
+        "predicted",
+        "at Hz",
+        "at least",
+        "tells at Hz",
+        "rms of the input",
+    )
+    if rows:
+        yield Section(
+            title="What the logs of the fit say of the loop",
+            part="certificate",
+            screen=False,
+            tables=(Table(head=head, rows=rows, align="<<<>>>>><"),),
+            remarks=(
+                "The response of each log, what the model leaves of it included, under the law. Samples that were "
+                "fitted are not independent: they can refute the law, and confirm nothing. Beyond the band, and where "
+                "a resonance is narrower than its lines, a log says nothing.",
+            ),
+        )
 
 
 def _describe_draws(certificate: Certificate) -> Iterator[Section]:

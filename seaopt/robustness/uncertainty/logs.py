@@ -1,0 +1,259 @@
+r"""The logs of a fit as last judge of a law: Ms and stability on the response that each of them shows.
+
+A log's outputs less those that the fitted model simulates have a response :math:`\hat E` from the command in discs of
+radius R (`seaopt.frequency.residual`). Around the model's own response G the law's loop is then
+:math:`1 + C (G + \hat E)`, and of m lines at a risk :math:`\alpha`
+
+- *refuted*, where a line has :math:`|1 + C (G + \hat E)| + |C| R(\alpha/m) < 1/M_s`, or all discs leave zero out and
+  the loop turns about it once more, or less, than the model's;
+- *confirmed*, by samples that were not fitted, where all lines have :math:`|1 + C(G + \hat E)| - x - M_s x^2/2 \ge
+  1/M_s`, x being the radial bound of R, and lie about the crossover;
+- *undecided* otherwise. Samples that were fitted are not independent: they can refute, and confirm nothing.
+
+Beyond the lines whose discs are small nothing is said, and the model stands as the other checks judge it. With dry
+friction G is the response of the simulated outputs by the same windows, so that model and log are compared at the log's
+amplitude; a line at which the model itself breaks the limit there is one only where the log is worse than the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Complex
+
+from seaopt.codec import OrInfinite
+from seaopt.control import Controller
+from seaopt.control.laws.delay import find_given_drive_delay
+from seaopt.control.loops.measured.plant import hold_response
+from seaopt.errors import SeaoptError
+from seaopt.estimation import Experiment, Fit
+from seaopt.estimation.result.findings import Nuisance
+from seaopt.formatting import format_number
+from seaopt.frequency.residual import ResidualResponse, measure_residual
+from seaopt.frequency.response import Lines
+from seaopt.frequency.sampled import sampled_response
+from seaopt.parameters import ParameterSet
+from seaopt.plants.friction import has_friction
+from seaopt.records import record
+from seaopt.simulation import Clock, linearise, make_model
+
+REFUTE, CONFIRM = 0.01, 0.05  # the risk of a false statement
+GRACE = 0.05  # of Ms: an actuator is not its model to the last digit
+LARGEST_DISC = 0.5  # of the distance from zero: where discs are larger, the log says nothing
+SMOOTH = 5  # lines of which the median disc decides whether one tells
+FEWEST_LINES = 8
+PERIODS = 120.0  # of the bandwidth in the longest window
+HIGHEST = 0.5  # of the Nyquist frequency of log and law: above, folding is no longer small
+ABOUT = 0.5, 1.5  # of the crossover, from below which to above which lines must lie to confirm
+Samples = Literal["fitted", "held out", "validate"]
+Outcome = Literal["confirmed", "refuted", "undecided"]
+
+
+@record
+class LogVerdict:
+    """What a log says of the law's loop, as measured and as the model predicts it for this log."""
+
+    experiment: str
+    samples: Samples
+    outcome: Outcome
+    band_hz: tuple[float, float]  # in which the log can tell
+    ms: OrInfinite  # the largest in the band; infinite where the loop is unstable
+    ms_hz: float  # where it is largest, or surest
+    ms_least: OrInfinite  # what the log leaves at least, of what contradicts the model
+    ms_predicted: float  # at `ms_hz`
+    confidence: float | None  # of a refutation, or a confirmation; None of samples that were fitted
+    amplitude: float  # rms of the input, in `unit`
+    unit: str
+    at_amplitude: bool  # friction is dry: at another amplitude the response is another one
+
+    @property
+    def text(self) -> str:
+        """What it says, in words."""
+        low, high = (format_number(f, 3) for f in self.band_hz)
+        measured = "UNSTABLE" if np.isinf(self.ms) else f"Ms {self.ms:.3g}"
+        said = f"{self.samples} log {self.experiment}: measured {measured} at {self.ms_hz:.3g} Hz, "
+        said += f"predicted {self.ms_predicted:.3g}; it tells from {low} to {high} Hz"
+        if self.at_amplitude:
+            said += f", at its amplitude of {self.amplitude:.3g} {self.unit} rms"
+        if self.confidence is None:
+            return f"{said}; not independent"
+        return f"{said}; {self.outcome}" + ("" if self.outcome == "undecided" else f" at {100 * self.confidence:g} %")
+
+
+@record(eq=False)
+class _Record:
+    """A part of a log beside the fit's simulation of it."""
+
+    experiment: Experiment
+    samples: Samples
+    own: Nuisance
+    model: Any  # outputs by rows, as the sensors' gains have them
+    error: Any
+    rows: slice
+
+
+def judge_log(
+    controller: Controller, fit: Fit, experiment: Experiment, ms: float
+) -> tuple[tuple[LogVerdict, ...], str]:
+    """Return what a log says of a law that is to keep Ms, whole and where it was held out; or why it says nothing."""
+    try:
+        parts = list(_list_records(fit, experiment, controller))
+        found = [_judge(controller, fit.parameters, part, ms * (1.0 + GRACE)) for part in parts]
+    except SeaoptError as error:
+        return (), f"log {experiment.name} does not judge the law: {error}"
+    silent = f"log {experiment.name} says nothing of this loop: it is too short, or too weak"
+    return tuple(verdict for verdict in found if verdict), silent if found[:1] == [None] else ""
+
+
+def _list_records(fit: Fit, experiment: Experiment, controller: Controller) -> Iterator[_Record]:
+    """Yield a log with its simulation, and what was held out of it alone."""
+    lacking = {*controller.signals} & {*experiment.plant.outputs} - {*experiment.outputs}
+    if lacking or controller.command.input not in experiment.log.signals:
+        return
+    predicted, n = fit.predict(experiment), len(experiment.log)
+    names = [name for name in controller.signals if name in experiment.outputs]
+    gain = np.array([predicted.own.gain[name] for name in names])[:, None]
+    model = np.array([predicted.model[name] for name in names]) / gain
+    error = np.array([predicted.measured[name] for name in names]) / gain - model
+    fitted = any(experiment is each for each in fit.experiments)
+    whole = _Record(
+        experiment=experiment,
+        samples="fitted" if fitted else "validate",
+        own=predicted.own,
+        model=model,
+        error=error,
+        rows=slice(0, n),
+    )
+    yield whole
+    if fitted and fit.holdout:
+        yield replace(whole, samples="held out", rows=slice(n - int(fit.holdout * n), n))
+
+
+def _measure(controller: Controller, part: _Record) -> ResidualResponse | None:
+    """Return the response of a record, up to where a law's loop can be told from it."""
+    log, command = part.experiment.log, log_input(controller, part)
+    good = np.isfinite(command) & np.all(np.isfinite(part.model) & np.isfinite(part.error), axis=0)
+    good[: part.rows.start] = False
+    joined = np.zeros(len(log), dtype=bool)
+    for rows in part.experiment.log_segments:
+        joined[rows] = True
+        joined[rows.start] = False  # no run goes over a gap
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (good & joined).astype(int), [0]]))).reshape(-1, 2)
+    if not np.any(good) or np.ptp(command[good]) == 0.0:
+        return None
+    return measure_residual(
+        command,
+        part.model,
+        part.error,
+        log.period,
+        [slice(a, b) for a, b in edges.tolist()],
+        longest_s=PERIODS / controller.spec.bandwidth_hz,
+        highest_hz=HIGHEST * 0.5 / max(log.period, controller.sample_time_s),
+    )
+
+
+def log_input(controller: Controller, part: _Record) -> Any:
+    """Return what the log has of the command."""
+    return part.experiment.log[controller.command.input]
+
+
+def _weigh(controller: Controller, part: _Record, f: Lines) -> Complex[np.ndarray, "y m"]:
+    """Return what of the loop gain is the law's, per response of the log's outputs: at the law's hold and delays."""
+    read = [name in part.experiment.outputs for name in controller.signals]
+    feedback = controller.law.feedback_responses(f)[: len(read)][read]
+    clock = Clock(period=part.experiment.log.period, hold=part.experiment.hold)
+    ratio = hold_response(f, Clock(period=controller.sample_time_s)) / hold_response(f, clock)
+    given, late = find_given_drive_delay(controller.spec), controller.spec.loop_delay_samples * controller.sample_time_s
+    if controller.spec.delay_samples is not None:  # the whole loop, with the log's delay in it
+        late = max(late - part.own.delay_s, 0.0)
+    elif given is not None:
+        late += given - part.own.delay_s
+    return feedback * (controller.command.per_effort * ratio * np.exp(-2j * np.pi * f * late))
+
+
+def _find_base(controller: Controller, params: ParameterSet, part: _Record, f: Lines) -> Any:
+    """Return the linear model's outputs per input as the log's clock has them."""
+    experiment, names = part.experiment, [name for name in controller.signals if name in part.experiment.outputs]
+    model = linearise(make_model(experiment.plant, experiment.apply_own(params), (), tuple(names)))
+    clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=part.own.delay_s)
+    source = list(experiment.plant.inputs).index(controller.command.input)
+    return sampled_response(model, np.zeros(0), clock, f, source)[0].T
+
+
+def _judge(controller: Controller, params: ParameterSet, part: _Record, limit: float) -> LogVerdict | None:
+    """Return what a record says of a law; None where it says nothing."""
+    from scipy.ndimage import median_filter  # deferred: 0.2 s
+
+    response = _measure(controller, part)
+    if response is None:
+        return None
+    f, plant = response.frequency_hz, part.experiment.plant
+    dry = has_friction(plant, part.experiment.apply_own(params))
+    c = _weigh(controller, part, f)
+    loop, error, std, unseen = response.read(c)
+    if not dry:
+        loop = np.sum(c * _find_base(controller, params, part, f), axis=0)
+    predicted, measured = np.abs(1.0 + loop), np.abs(1.0 + loop + error)
+    radius = std * response.widen(REFUTE / response.lines) + unseen
+    size = np.maximum(predicted, measured)
+    told = median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC
+    if np.count_nonzero(told) < FEWEST_LINES:
+        return None
+    first, last = np.flatnonzero(told)[[0, -1]]
+    gapless = bool(np.all(told[first:last]))
+    f, loop, error, std, unseen, predicted, measured, radius, windows = (
+        x[told] for x in (f, loop, error, std, unseen, predicted, measured, radius, response.windows)
+    )
+    low = 1.0 / (measured + radius)
+    counts = (predicted >= 1.0 / limit) | (measured + radius < predicted)
+    at = int(np.argmax(np.where(counts, low, 0.0)))
+    least, ms = float(np.max(low[counts], initial=0.0)), float(1.0 / np.min(measured))
+    turned = gapless and _is_turned(1.0 + loop, error, radius)
+    if turned:
+        at, least, ms = int(np.argmin(measured)), np.inf, np.inf
+    refuted = least > limit
+    at = at if refuted else int(np.argmin(measured))
+    independent = part.samples != "fitted"
+    confirmed = independent and gapless and not refuted and _covers(controller, f)
+    confirmed = confirmed and _keeps(limit, measured, std, unseen, windows)
+    outcome: Outcome = "refuted" if refuted else "confirmed" if confirmed else "undecided"
+    return LogVerdict(
+        experiment=part.experiment.name,
+        samples=part.samples,
+        outcome=outcome,
+        band_hz=(float(f[0]), float(f[-1])),
+        ms=ms if not refuted or turned else float(1.0 / measured[at]),
+        ms_hz=float(f[at]),
+        ms_least=least,
+        ms_predicted=float(1.0 / predicted[at]),
+        confidence=None if not independent else 1.0 - (REFUTE if refuted else CONFIRM),
+        amplitude=float(np.nanstd(log_input(controller, part)[part.rows])),
+        unit=controller.command.unit,
+        at_amplitude=dry,
+    )
+
+
+def _is_turned(model: Any, error: Any, radius: Any) -> bool:
+    """Tell whether 1 + L turns about zero otherwise than the model's, all discs leaving zero out."""
+    ratio = 1.0 + error / model
+    steps = np.angle(ratio[1:] / ratio[:-1])
+    ends = [abs(error[k]) + radius[k] < abs(model[k]) for k in (0, -1)]
+    known = np.all(np.abs(ratio) * np.abs(model) > radius) and np.all(np.abs(steps) < 0.5 * np.pi)
+    return bool(all(ends) and known and abs(np.sum(steps)) > np.pi)
+
+
+def _covers(controller: Controller, f: Lines) -> bool:
+    """Tell whether lines lie about the crossover."""
+    middle = controller.achieved.crossover_hz or controller.spec.bandwidth_hz
+    return bool(f[0] <= ABOUT[0] * middle and f[-1] >= ABOUT[1] * middle)
+
+
+def _keeps(limit: float, measured: Lines, std: Lines, unseen: Lines, windows: Lines) -> bool:
+    """Tell whether every line keeps the limit of Ms, the error of each along a radius at its confidence."""
+    from scipy.special import stdtrit  # deferred: 0.1 s
+
+    x = std * stdtrit(2.0 * windows - 2.0, 1.0 - CONFIRM) / np.sqrt(2.0) + unseen
+    return bool(np.all(measured - x - 0.5 * limit * x**2 >= 1.0 / limit))

@@ -1,0 +1,201 @@
+"""The fit's logs judge a law: a stand of equations of the test's own, with a mode at 40 Hz that the model may lack."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import seaopt as so
+from seaopt.control import tune_schedule
+from seaopt.errors import LogError
+from seaopt.files import to_json
+from seaopt.frequency.residual import measure_residual
+from seaopt.problem.stages import certify_problem
+from seaopt.robustness.certificate.limits import LOG_SENSITIVITY
+from seaopt.robustness.certificate.simulated import STEPS
+from seaopt.robustness.uncertainty.logs import GRACE
+from tests.checks import leave_out
+
+RATE, SECONDS, MODE_HZ, ZETA, NOISE = 1000.0, 20.0, 40.0, 0.02, 2.0
+SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_steps():
+    """Let certificates have no simulated steps: what is looked at here is linear."""
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out(patch, STEPS)
+        yield
+
+
+def sampled_stand(params, size):
+    """Return numerator and denominator in z of F1/I = k e/(M s^2 + b s + k) (1 + size w s/(s^2 + 2 zeta w s + w^2))."""
+    p = {name: item.value for name, item in params.items()}
+    per, w = p["l"] / (2 * np.pi * p["N_p"]), 2 * np.pi * MODE_HZ
+    mass, damping, effort = p["J"] / per**2, p["b_r"] / per**2, p["eta"] * p["K_tau"] / per
+    mode = np.array([1.0, 2 * ZETA * w, w**2])
+    num, den = p["k"] * effort * np.polyadd(mode, [size * w, 0.0]), np.convolve([mass, damping, p["k"]], mode)
+    b, a, _ = scipy.signal.cont2discrete((num, den), 1.0 / RATE)
+    return np.ravel(b), a
+
+
+def record(params, size=0.0, seed=1, amplitude=2.0):
+    rng, time = np.random.default_rng(seed), np.arange(round(SECONDS * RATE)) / RATE
+    growth = np.log(1000.0)
+    phase = 2 * np.pi * 0.1 * SECONDS / growth * np.expm1(growth * time / SECONDS)
+    current = amplitude * np.sin(phase) + rng.normal(scale=0.25 * amplitude, size=time.size)
+    force = scipy.signal.lfilter(*sampled_stand(params, size), current) + rng.normal(scale=NOISE, size=time.size)
+    return so.Log.from_arrays(time=time, I=current, F1=force)
+
+
+@pytest.fixture(scope="module")
+def fit_to(stand, thor):
+    def fit(*sizes, validate=(), **options):
+        experiments = [so.Experiment(plant=stand, log=record(thor, size, k), name=f"chirp{k}") for k, size in sizes]
+        others = [so.Experiment(plant=stand, log=record(thor, size, k), name=f"other{k}") for k, size in validate]
+        start = thor.update(J=3e-6).free("J", "b_r")
+        return so.fit(experiments, start, validation=others, diagnostics=False, **options)
+
+    return fit
+
+
+@pytest.fixture(scope="module")
+def right(fit_to):
+    return fit_to((1, 0.0), validate=[(2, 0.0)], holdout=0.25)
+
+
+@pytest.fixture(scope="module")
+def controller(stand, right):
+    return so.tune(stand, right.parameters, SPEC)
+
+
+def certify(controller, stand, fit):
+    return so.certify(controller, {"stand": stand}, fit, samples=20, simulations=False)
+
+
+def rows_of(certificate):
+    return [row for row in certificate.requirements if row.name == LOG_SENSITIVITY]
+
+
+def sensitivity(controller, params, size, f):
+    z, (b, a) = np.exp(2j * np.pi * f / RATE), sampled_stand(params, size)
+    plant = np.polyval(b, z) / np.polyval(a, z) * controller.command.per_effort * z**-controller.compute_delay_samples
+    return 1.0 / np.abs(1.0 + plant * controller.law.measurement_response(f))
+
+
+def test_mode_that_the_model_lacks_fails_by_the_name_of_the_log(stand, thor, fit_to, controller):
+    certificate = certify(controller, stand, fit_to((1, 0.05)))
+    (row,) = rows_of(certificate)
+    (verdict,) = certificate.logs
+    assert not row.met and not certificate.met
+    assert row.plant == "log:chirp1" and row.limit == pytest.approx(1.6 * (1 + GRACE))
+    assert verdict.outcome == "refuted" and 38.0 < verdict.ms_hz < 44.0
+    assert "chirp1: measured Ms" in row.where and "predicted" in row.where
+    f = np.linspace(38.0, 46.0, 2000)
+    peak = np.max(sensitivity(controller, thor, 0.05, f))
+    assert verdict.ms_least < peak
+    assert verdict.ms == pytest.approx(sensitivity(controller, thor, 0.05, np.array([verdict.ms_hz]))[0], rel=0.1)
+    assert verdict.ms_predicted == pytest.approx(
+        sensitivity(controller, thor, 0.0, np.array([verdict.ms_hz]))[0], rel=0.05
+    )
+
+
+def test_mode_that_makes_the_loop_unstable_is_refuted(stand, fit_to, controller):
+    (row,) = rows_of(certify(controller, stand, fit_to((1, 0.2))))
+    assert not row.met
+
+
+def test_right_model_passes_and_fitted_samples_confirm_nothing(stand, controller, right):
+    with_room = replace(controller, spec=replace(SPEC, max_sensitivity=1.9))
+    certificate = certify(with_room, stand, right)
+    fitted, held_out, other = certificate.logs
+    assert all(row.met for row in rows_of(certificate)) and len(rows_of(certificate)) == 3
+    assert (fitted.experiment, fitted.samples, fitted.outcome) == ("chirp1", "fitted", "undecided")
+    assert fitted.confidence is None and fitted.text.endswith("not independent")
+    assert fitted.band_hz[0] < 2.0 and fitted.band_hz[1] > 100.0
+    assert (held_out.experiment, held_out.samples) == ("chirp1", "held out")
+    assert (other.experiment, other.samples, other.outcome) == ("other2", "validate", "confirmed")
+    assert other.confidence == 0.95 and other.text.endswith("confirmed at 95 %")
+
+
+def test_log_for_validation_refutes_at_its_confidence(stand, controller, fit_to):
+    _, other = certify(controller, stand, fit_to((1, 0.0), validate=[(2, 0.05)])).logs
+    assert (other.experiment, other.outcome, other.confidence) == ("other2", "refuted", 0.99)
+
+
+def test_verdicts_come_back_from_the_file(stand, controller, right):
+    certificate = certify(controller, stand, right)
+    again = so.Certificate.from_dict(
+        json.loads(to_json(certificate.to_dict())), controller, {"stand": stand}, right.parameters
+    )
+    assert again.logs == certificate.logs and rows_of(again) == rows_of(certificate)
+
+
+def test_friction_is_judged_at_the_amplitude_of_its_log(stand, thor):
+    rubbing = so.plants.let_stick(stand)
+    params = thor.update(f_c=60.0)
+    log = record(thor)
+    force = so.simulate(rubbing, params, log)["F1"] + np.random.default_rng(5).normal(scale=NOISE, size=len(log))
+    log = so.Log.from_arrays(time=log.time, I=log["I"], F1=force)
+    start = params.update(f_c=50.0).free("J", "b_r", "f_c")
+    fit = so.fit([so.Experiment(plant=rubbing, log=log, name="chirp")], start, diagnostics=False)
+    tuned = so.tune(rubbing, fit.parameters, SPEC)
+    (verdict,) = certify(tuned, rubbing, fit).logs
+    assert verdict.at_amplitude and verdict.amplitude == pytest.approx(np.std(log["I"]))
+    assert verdict.outcome == "undecided" and "at its amplitude of 1.49 A rms" in verdict.text
+
+
+def test_values_without_logs_and_logs_of_other_plants_judge_nothing(stand, swing, controller, right, thor):
+    assert not certify(controller, stand, thor).logs
+    of_swing = so.tune(swing, thor, SPEC)
+    certificate = so.certify(of_swing, {"swing": swing}, right, samples=20, simulations=False)
+    assert not certificate.logs and not certificate.remarks
+
+
+def test_log_that_says_nothing_is_a_note(stand, thor, controller):
+    weak = so.Experiment(plant=stand, log=record(thor, amplitude=1e-3), name="weak")
+    fit = so.fit([weak], thor.free("b_r"), diagnostics=False)
+    certificate = certify(controller, stand, fit)
+    assert not certificate.logs and not rows_of(certificate)
+    assert any("log weak says nothing of this loop" in note for note in certificate.notes)
+
+
+def test_logs_that_cannot_be_read_again_are_a_note(monkeypatch, stand, right, controller):
+    problem = so.read_problem(so.demo_path())
+
+    def fail(_):
+        raise LogError("chirp.csv: is not there; give another")
+
+    monkeypatch.setattr(type(problem), "experiments", fail)
+    monkeypatch.setattr("seaopt.problem.stages.certify", lambda *_, **__: certify(controller, stand, right))
+    stored = replace(right, experiments=(), validation=())
+    assert any("cannot be read: chirp.csv" in note for note in certify_problem(problem, controller, stored).notes)
+
+
+def test_schedule_is_judged_where_its_variable_stood(stand, thor, fit_to):
+    fit = fit_to((1, 0.0))
+    m_l = thor["m_l"].value
+    schedule = tune_schedule(stand, fit.parameters, SPEC, "m_l", [m_l, 2.0 * m_l])
+    certificate = so.certify(schedule, {"stand": stand}, fit, samples=8, simulations=False)
+    assert [bool(place.logs) for place in certificate.places] == [True] + [False] * (len(certificate.places) - 1)
+    assert [row.place for row in rows_of(certificate)] == [("m_l", m_l)]
+
+
+def test_discs_of_what_a_model_leaves_hold_the_truth_as_often_as_stated():
+    rng, n, period, outside, lines = np.random.default_rng(3), 8000, 1e-3, 0, 0
+    b, a = scipy.signal.butter(2, 0.1)
+    for _ in range(20):
+        u = rng.normal(size=n)
+        error = 0.1 * scipy.signal.lfilter(b, a, u) + rng.normal(scale=0.5, size=n)
+        found = measure_residual(
+            u, np.zeros((1, n)), error[None], period, [slice(0, 3000), slice(3001, n)], longest_s=0.25, highest_hz=200.0
+        )
+        _, truth = scipy.signal.freqz(b, a, found.frequency_hz, fs=1.0 / period)
+        _, centre, std, _ = found.read(np.ones((1, found.frequency_hz.size)))
+        outside += np.sum(np.abs(centre - 0.1 * truth) > std * found.widen(0.05))
+        lines += truth.size
+    assert outside / lines == pytest.approx(0.05, abs=0.015)
