@@ -73,7 +73,7 @@ def hash_law(law: RunnableLaw | RunnableSchedule, outer: OuterLoop | None = None
     scale = np.max(np.abs(wound), initial=0.0)
     shares = np.round(wound / (scale or 1.0), 9) + 0.0  # of the largest, for those that only rounding keeps from zero
     numbers |= {"heat": _round(heat), "anti_windup": [*_round([scale]), *shares.tolist()]}
-    content = plain(to_content({"outer": outer, **numbers}))
+    content = plain(to_content({**numbers, "outer": outer or law.outer}))
     return digest_plain(json.loads(json.dumps(content), parse_int=float))[:16]  # 9 and 9.0 are one limit
 
 

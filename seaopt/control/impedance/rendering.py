@@ -231,7 +231,9 @@ def add_impedance(
     """
     require_type(impedance, Impedance, "impedance", "give an Impedance", ControlError)
     outer = find_link(controller, plant, parameters).outer(impedance)
-    return replace(controller, outer=replace(outer, plant=name, direction=round(outer.direction, 9)))
+    assert plant.port is not None  # else it has no link
+    position, direction = str(plant.port.motion), round(outer.direction, 9)
+    return replace(controller, outer=replace(outer, plant=name, position=position, direction=direction))
 
 
 def apparent_impedance(link: ControlledLink, outer: OuterLoop, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:

@@ -158,6 +158,11 @@ class Controller(LoopDelays, Result, Worded):
         return list_further(self.compensation, self.gate)
 
     @property
+    def renders(self) -> bool:
+        """Whether it has an outer loop with a stiffness, so that its reference is a position of the link."""
+        return self.outer is not None and self.outer.stiffness > 0.0
+
+    @property
     def speed_loop(self) -> SpeedLoop | None:
         """The signal of a cascade's speed loop; None for another structure."""
         return self.spec.find_speed_loop(self.signals)

@@ -41,6 +41,7 @@ from jaxtyping import Float
 
 from seaopt.codec import Constraints
 from seaopt.control.loops.compensation.terms import Compensation
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.errors import ControlError, require_number
 from seaopt.formatting import join_words
@@ -447,10 +448,13 @@ class PlausibilityGate:
         )
 
 
-def list_further(terms: Compensation | None, gate: PlausibilityGate | None) -> tuple[str, ...]:
-    """Return the outputs that the terms of a law read besides its signals, then those that its gate does."""
+def list_further(
+    terms: Compensation | None, gate: PlausibilityGate | None, outer: OuterLoop | None = None
+) -> tuple[str, ...]:
+    """Return the outputs that the terms of a law read besides its signals, then those that gate and outer loop do."""
     read = () if terms is None else terms.reads
-    return tuple(dict.fromkeys((*read, *(() if gate is None else gate.reads))))
+    positions = () if outer is None else (outer.position,)
+    return tuple(dict.fromkeys((*read, *(() if gate is None else gate.reads), *positions)))
 
 
 def largest_step(plant: DigitalPlant, effort_limit: float) -> float:

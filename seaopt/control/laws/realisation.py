@@ -45,6 +45,7 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import Gains
 from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
 from seaopt.control.loops.law import SLOW_LAG, Law
+from seaopt.control.loops.outer_loop import FIRST, OuterLoop, OuterState, follow_link
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.formatting import join_words
 from seaopt.plants.motor.heat_guard import COLD, HeatGuard
@@ -75,6 +76,8 @@ class LawState:
         Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
     memory : (float, float)
         What the compensation, where there is one, keeps of the last sample.
+    outer : (float, float, float)
+        What the outer loop, where there is one, keeps.
     """
 
     x: Vector
@@ -83,6 +86,7 @@ class LawState:
     gate: GateState = GateState()
     heat: tuple[float, float] = COLD
     memory: Memory = FORGOTTEN
+    outer: OuterState = FIRST
 
     @property
     def status(self) -> str:
@@ -110,6 +114,8 @@ class Guarded:
         What lowers the limit as the winding warms up.
     compensation : Compensation, optional
         What is added to reference and effort; it may read further outputs.
+    outer : OuterLoop, optional
+        What makes the law's reference of an x_0, then the reference of every method, and of the link's position.
     """
 
     sample_time_s: float
@@ -119,6 +125,7 @@ class Guarded:
     command: tuple[str, str] = ("I", "A")
     heat: HeatGuard | None = None
     compensation: Compensation | None = None
+    outer: OuterLoop | None = None
 
     @property
     def measured(self) -> int:
@@ -127,8 +134,8 @@ class Guarded:
 
     @property
     def further(self) -> tuple[str, ...]:
-        """The outputs that its terms read besides, then those that its gate does."""
-        return list_further(self.compensation, self.gate)
+        """The outputs that its terms read besides, then those that its gate and its outer loop do."""
+        return list_further(self.compensation, self.gate, self.outer)
 
     @property
     def force_limit_N(self) -> float:
@@ -160,6 +167,9 @@ class Guarded:
             limit = show_command(self.command_limit, *self.command)
             raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
         added = 0.0
+        if self.outer is not None:
+            (position,) = self._take(readings, self.outer.position) if readings else (0.0,)
+            *_, reference = follow_link(self.outer.numbers, FIRST, reference, position)
         if self.compensation is not None:
             reads = self._take_terms(readings) or (0.0,) * len(self.compensation.reads)
             reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads, numbers)
@@ -167,18 +177,18 @@ class Guarded:
 
     def _take_terms(self, readings: Sequence[float]) -> tuple[float, ...]:
         """Return the readings of the terms, of all."""
-        if self.gate is None or not self.gate.reads:
+        if self.outer is None and (self.gate is None or not self.gate.reads):
             return tuple(readings)
         return tuple(readings[: 0 if self.compensation is None else len(self.compensation.reads)])
 
-    def _take_encoders(self, readings: Sequence[float]) -> list[float]:
-        """Return the readings of the gate's encoders, of all. Raises ControlError: they are not as many."""
+    def _take(self, readings: Sequence[float], *reads: str) -> list[float]:
+        """Return the readings of some of the further outputs, of all. Raises ControlError: they are not as many."""
         names = self.further
-        if self.gate is None or len(readings) != len(names):
+        if len(readings) != len(names):
             raise ControlError(
                 f"readings: the law reads {join_words(names)} besides, and got {len(readings)}; give one of each"
             )
-        return [readings[names.index(name)] for name in self.gate.reads]
+        return [readings[names.index(name)] for name in reads]
 
     def _check_measurement(self, measurement: Reading | None) -> Reading:
         """Return what was measured at rest: zero where it is left out, else as many numbers as there are signals."""
@@ -210,7 +220,13 @@ class Guarded:
         `readings` are of the outputs `further`, in their order. `advance` is the law: of reference,
         measurement, what is added to the effort, and its limit, the effort, what is left of it, and the next x.
         `numbers` of the compensation, where they are not its own; `noted`: further fields of the next state.
+        An outer loop comes first, and goes on with its last reference where what it is given is not a number.
         """
+        if self.outer is not None:
+            (position,), outer = self._take(readings, self.outer.position), state.outer
+            if is_number(reference) and is_number(position):
+                outer = follow_link(self.outer.numbers, outer, reference, position)
+            noted["outer"], reference = outer, outer[-1]
         if self.heat is None:
             return self._decide(state, reference, measurement, readings, self.command_limit, advance, numbers, noted)
         limit = min(self.command_limit, self.heat.limit(state.heat))
@@ -232,7 +248,7 @@ class Guarded:
         """Return the command within a limit, and the next state."""
         seen = state.gate
         if self.gate is not None:
-            encoders = self._take_encoders(readings) if self.gate.reads else ()
+            encoders = self._take(readings, *self.gate.reads) if self.gate.reads else ()
             regulated, seen = self.gate.screen(seen, float(np.ravel(measurement)[0]), encoders)
             measurement = regulated if self.measured == 1 else np.array([regulated, *np.ravel(measurement)[1:]])
             if seen.fault:
@@ -367,6 +383,7 @@ def runnable(
     tracking_time_s: float | None = None,
     gate: PlausibilityGate | Literal[False] | None = None,
     heat: HeatGuard | Literal[False] | None = None,
+    outer: bool = False,
 ) -> RunnableLaw:
     """Return a controller's law ready to run, as it is exported.
 
@@ -384,6 +401,8 @@ def runnable(
         Which readings are believed; the controller's own if left out, none with False.
     heat : HeatGuard or False, optional
         What lowers the limit as the winding warms up; `controller.heat_guard` if left out and the controller derates.
+    outer : bool
+        With the controller's outer loop, where it has one that renders a stiffness: the reference then is x_0.
 
     Raises
     ------
@@ -400,7 +419,7 @@ def runnable(
     9.0
     """
     parts = {name: getattr(controller, name) for name in ("law", "share", "gains", "observer", "link", "spec")}
-    return realise(
+    law = realise(
         **wind_up(parts, tracking_time_s),
         per_effort=controller.command.per_effort,
         command_limit=choose_limit(controller.command, controller.spec, command_limit),
@@ -409,6 +428,7 @@ def runnable(
         heat=(controller.heat_guard if controller.derate else None) if heat is None else heat or None,
         compensation=controller.compensation,
     )
+    return replace(law, outer=controller.outer) if outer and controller.renders else law
 
 
 def wind_up(controller: Mapping[str, Any], tracking_time_s: float | None) -> dict[str, Any]:

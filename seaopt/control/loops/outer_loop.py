@@ -10,10 +10,12 @@ x is the link's position as sampled, m or rad, and D(q) its filtered backward di
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.signal import lfilter
 
 from seaopt.codec import Constraints
 from seaopt.control.systems.block import Block
@@ -23,6 +25,8 @@ from seaopt.records import record
 from seaopt.units import mechanics_of
 
 POSITION, SPEED = "position", "speed"  # of the link
+OuterState = tuple[Any, Any, Any]  # the filter's, whether there was a sample before, and the last reference
+FIRST: OuterState = (0.0, 0.0, 0.0)
 
 
 @record
@@ -75,6 +79,8 @@ class OuterLoop:
         Of the position: m or rad.
     plant : str
         The name of the plant whose link it is, where it has one.
+    position : str
+        The output that is read for x.
 
     Examples
     --------
@@ -93,6 +99,7 @@ class OuterLoop:
     sample_time_s: Annotated[float, Constraints(gt=0.0)]
     place_unit: Annotated[str, Constraints(pattern="^(m|rad)$")]
     plant: str = ""
+    position: str = ""
 
     @property
     def impedance(self) -> Impedance:
@@ -131,9 +138,18 @@ class OuterLoop:
         reference, position : float
             x_0 and x, m or rad.
         """
-        speed = state + self.rate * position
-        reference_effort = self.direction * (self.stiffness * (reference - position) - self.damping * speed)
-        return reference_effort, self.pole * speed - self.rate * position
+        after, _, asked = follow_link(self.numbers, (state, 1.0, 0.0), reference, position)
+        return asked, after
+
+    @property
+    def numbers(self) -> list[float]:
+        """Its numbers, as `follow_link` takes them."""
+        return [self.direction * self.stiffness, self.direction * self.damping, self.pole, self.rate]
+
+    def run(self, references: Any, positions: Any) -> Float[np.ndarray, "... n"]:
+        """Return the force law's references over samples, from rest at the first position."""
+        speed = np.asarray(lfilter([self.rate, -self.rate], [1.0, -self.pole], positions - positions[..., :1]))
+        return self.direction * (self.stiffness * (references - positions) - self.damping * speed)
 
     @property
     def block(self) -> Block:
@@ -148,3 +164,10 @@ class OuterLoop:
     def difference_slope(self, z: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
         """Return dD/dz."""
         return self.rate * (1.0 - self.pole) / (z - self.pole) ** 2
+
+
+def follow_link(numbers: Sequence[Any], kept: Sequence[Any], reference: Any, position: Any) -> OuterState:
+    """Return what an outer loop keeps after a sample, the force law's reference last; of floats, or of expressions."""
+    (stiffness, damping, pole, rate), (state, before, _) = numbers, kept
+    speed = before * (state + rate * position)  # at first the link is at rest
+    return pole * speed - rate * position, 1.0, stiffness * (reference - position) - damping * speed

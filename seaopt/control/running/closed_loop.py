@@ -279,7 +279,8 @@ def _noise(
 
     def find_std(values: CompletedParameters, name: str) -> float:
         if name in loop.standing:
-            return loop.sensors.noise_std.get(name, 0.0) if name == loop.link else 0.0
+            fed_back = name == loop.link or (loop.law.outer is not None and name == loop.law.outer.position)
+            return loop.sensors.noise_std.get(name, 0.0) if fed_back else 0.0
         return loop.sensors.combine_errors(loop.plant, values, name)[0]
 
     std = np.array([[find_std(values, name) for name in loop.signals] for values in params])

@@ -35,6 +35,7 @@ class Equilibrium:
     # reference, force, current_A, energy_J: shape (runs,); F_ref and the measured output (N); the current; what the
     # plant stores, zero where it declares no energy
     reference: Runs
+    given: Runs  # what the law is given for it: x_0 with an outer loop around it
     force: Runs
     current_A: Runs
     energy_J: Runs
@@ -57,10 +58,10 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
     assert isinstance(law, RunnableLaw)  # a schedule is held at a value
     observe = observe_function(plant, sticks=False)
     names, rows = list(plant.outputs), [find_rest(plant, values) for values in params]
-    figures = np.zeros((len(params), 4))
+    figures = np.zeros((len(params), 5))
     z = np.zeros((len(params), loop.law_states + loop.waiting))
     for run, ((x, u), values) in enumerate(zip(rows, params, strict=True)):
-        if not (np.any(x) or np.any(u)) and law.compensation is None:
+        if not (np.any(x) or np.any(u)) and law.compensation is None and law.outer is None:
             continue
         y = np.array(observe(0.0, x, u, values.vector)).ravel()
         read = y[[names.index(name) for name in loop.fed_back]]
@@ -72,15 +73,20 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
             law, read if law.measured > 1 else force, float(u[0]) - law.per_effort * added, plant, loop.regulated
         )
         reference -= weight
+        given = reference
+        if law.outer is not None:
+            position = float(y[names.index(law.outer.position)]) if law.outer.position in names else 0.0
+            given = position + reference / (law.outer.direction * law.outer.stiffness)
         forgotten = np.zeros(loop.law_states - inner.size - 1)
         z[run] = np.concatenate([inner, forgotten, np.full(1 + loop.waiting, u[0])])
-        figures[run] = reference, force, u[0], 0.0 if plant.energy is None else y[-1]
-    reference, force, current, energy = figures.T.copy()
+        figures[run] = reference, given, force, u[0], 0.0 if plant.energy is None else y[-1]
+    reference, given, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)
     unit = plant.outputs[loop.regulated]
     return Equilibrium(
         state=state,
         reference=reference,
+        given=given,
         force=force,
         current_A=current,
         energy_J=energy,

@@ -1,8 +1,9 @@
-"""A law's step, scheduled or not, as an expression of CasADi, from the same numbers: gate, hold, terms, limit, heat.
+"""A law's step, scheduled or not, as an expression of CasADi: outer loop, gate, hold, terms, limit, heat.
 
 A law whose inputs are numbers (within +-1e15) gives finite ones, so that only the inputs are asked. What is kept from
 one sample to the next is the law's state, what its terms remember, the gate's last reading with how many were refused
-since, the temperatures, the place of a schedule, and the last command, which is repeated where a sample cannot be used.
+since, the temperatures, the place of a schedule, what the outer loop keeps, and the last command, which is repeated
+where a sample cannot be used.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from jaxtyping import Bool, Float
 from seaopt.control.laws.plausibility import LARGEST
 from seaopt.control.laws.realisation import LawState, RunnableLaw
 from seaopt.control.loops.compensation.terms import CompensationShape, compensate
+from seaopt.control.loops.outer_loop import FIRST, follow_link
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, ScheduleShape, ScheduleState
 from seaopt.plants.motor.heat_guard import HEAT_NUMBERS, limit_current, warm_winding
 from seaopt.records import record
 from seaopt.simulation.direct_call import DirectCall
 
-GATE_NUMBERS = 5
+GATE_NUMBERS, OUTER_NUMBERS = 5, 4
 CHUNK = 500  # samples that a law is run over in one call
 
 
@@ -43,6 +45,7 @@ class LawShape:
     schedule: ScheduleShape | None = None
     holds: bool = True  # the last command where an input is not a number
     encoders: tuple[str, ...] = ()  # that the gate reads
+    position: str = ""  # that the outer loop reads, where there is one
 
     @classmethod
     def of_law(cls, law: RunnableLaw | RunnableSchedule) -> LawShape:
@@ -57,18 +60,20 @@ class LawShape:
             compensation=CompensationShape() if law.compensation is None else law.compensation.shape,
             schedule=schedule,
             encoders=() if law.gate is None else law.gate.reads,
+            position="" if law.outer is None else law.outer.position,
         )
 
     @property
     def further(self) -> tuple[str, ...]:
         """The outputs that are read besides what is fed back."""
-        return tuple(dict.fromkeys((*self.compensation.reads, *self.encoders)))
+        positions = (self.position,) if self.position else ()
+        return tuple(dict.fromkeys((*self.compensation.reads, *self.encoders, *positions)))
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many numbers are kept: of state, terms, gate, temperatures, place, command."""
-        placed = int(self.schedule is not None)
-        return self.states, self.compensation.remembered, 3 * self.gated, 2 * self.heated, placed, 1
+        """How many numbers are kept: of state, terms, gate, temperatures, place, outer loop, command."""
+        placed, around = int(self.schedule is not None), len(FIRST) * bool(self.position)
+        return self.states, self.compensation.remembered, 3 * self.gated, 2 * self.heated, placed, around, 1
 
     @property
     def kept(self) -> int:
@@ -77,9 +82,11 @@ class LawShape:
 
     @property
     def number_sizes(self) -> tuple[int, ...]:
-        """How many numbers of each kind `list_numbers` gives: of the law by itself, limit, command, guards, terms."""
+        """How many numbers of each kind `list_numbers` gives: of the law by itself, limit, command, what is around it,
+        terms.
+        """
         gate = GATE_NUMBERS * self.gated + (2 + len(self.encoders) if self.encoders else 0)
-        guards = gate, HEAT_NUMBERS * self.heated
+        guards = gate, HEAT_NUMBERS * self.heated, OUTER_NUMBERS * bool(self.position)
         law = sum(self.matrix_sizes) if self.schedule is None else self.schedule.size
         return law, 1, 1, *guards, self.compensation.size if self.schedule is None else 0
 
@@ -98,6 +105,7 @@ def list_numbers(law: RunnableLaw | RunnableSchedule) -> Float[np.ndarray, " m"]
         numbers += [*gate.range_N, gate.max_step_N, gate.max_held, gate.ramp_A_per_s * law.sample_time_s]
         numbers += [] if gate.agreement is None else gate.agreement.numbers
     numbers += [] if law.heat is None else law.heat.numbers
+    numbers += [] if law.outer is None else law.outer.numbers
     if isinstance(law, RunnableSchedule):
         return np.concatenate([law.numbers, numbers])
     numbers += [] if law.compensation is None else law.compensation.numbers
@@ -114,6 +122,7 @@ def list_kept(law: RunnableLaw | RunnableSchedule, state: LawState) -> Float[np.
         () if law.gate is None else (np.nan_to_num(seen.measurement), not np.isnan(seen.measurement), seen.held),
         () if law.heat is None else state.heat,
         (state.place,) if isinstance(state, ScheduleState) else (),
+        () if law.outer is None else state.outer,
         (state.current_A,),
     )
     return np.concatenate(parts).astype(float)
@@ -178,8 +187,14 @@ def express_step(
     """Return the command and what is kept after a sample; `further`: the readings of what the shape names so; `place`:
     the scheduling variable, where there is one.
     """
-    law, most, gain, gate, heat, added = ca.vertsplit(numbers, np.cumsum([0, *shape.number_sizes]).tolist())
-    x, memory, seen, rises, at, last = ca.vertsplit(kept, np.cumsum([0, *shape.sizes]).tolist())
+    law, most, gain, gate, heat, around, added = ca.vertsplit(numbers, np.cumsum([0, *shape.number_sizes]).tolist())
+    x, memory, seen, rises, at, outer, last = ca.vertsplit(kept, np.cumsum([0, *shape.sizes]).tolist())
+    if shape.position:
+        position = further[shape.further.index(shape.position)]
+        moved = ca.vertcat(*follow_link(ca.vertsplit(around), ca.vertsplit(outer), reference, position))
+        if shape.holds:
+            moved = ca.if_else(ca.logic_and(_is_number(reference), _is_number(position)), moved, outer)
+        outer, reference = moved, moved[-1]
     fault, known, measured, memory, rises = 0.0, 1.0, list(measured), ca.vertsplit(memory), ca.vertsplit(rises)
     if shape.gated:
         encoders = [further[shape.further.index(name)] for name in shape.encoders]
@@ -215,7 +230,7 @@ def express_step(
     if shape.heated:
         command = ca.fmin(ca.fmax(command, -limit), limit)
         rises = warm_winding(ca.vertsplit(heat), rises, command, ca)
-    return command, ca.vertcat(moved, *(seen if shape.gated else ()), *rises, at, command)
+    return command, ca.vertcat(moved, *(seen if shape.gated else ()), *rises, at, outer, command)
 
 
 def _advance(

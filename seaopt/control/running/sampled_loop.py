@@ -124,7 +124,8 @@ class SampledLoop:
         weighed = None if gravity is None or self.plant.moves else gravity.reads
         gate = None if self.law.gate is None else self.law.gate.agreement
         encoders = () if gate is None or self.plant.moves else gate.reads
-        named = dict.fromkeys((self.link, weighed, *encoders))
+        position = None if self.law.outer is None or self.plant.moves else self.law.outer.position
+        named = dict.fromkeys((self.link, weighed, *encoders, position))
         return tuple(name for name in named if name is not None and name not in self.plant.outputs)
 
     @property

@@ -224,7 +224,9 @@ class ScheduledController(Result, Worded):
             broken=broken,
         )
 
-    def runnable(self, *, limit: float | None = None, tracking_time_s: float | None = None) -> RunnableSchedule:
+    def runnable(
+        self, *, limit: float | None = None, tracking_time_s: float | None = None, outer: bool = False
+    ) -> RunnableSchedule:
         """Return the law ready to run, with the guards and the compensation of its first controller.
 
         Parameters
@@ -233,6 +235,8 @@ class ScheduledController(Result, Worded):
             Of the command, in its unit; the specification's if left out.
         tracking_time_s : float, optional
             Of the anti-windup.
+        outer : bool
+            With its outer loop, where it has one that renders a stiffness.
         """
         first = self.controllers[0]
         law = make_runnable(
@@ -244,7 +248,8 @@ class ScheduledController(Result, Worded):
             command=(self.command.input, self.command.unit),
             compensations=[each.compensation for each in self.controllers],
         )
-        return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None)
+        around = first.outer if outer and first.renders else None
+        return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None, outer=around)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of controller.json (schema seaopt/controller/3)."""

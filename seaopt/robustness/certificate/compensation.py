@@ -26,11 +26,11 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control import Controller, Law, Loop, runnable
+from seaopt.control import Controller
 from seaopt.control.compensation.compensate import ENOUGH, find_compensation_margins
 from seaopt.control.loops.compensation.stability import CompensationMargin
-from seaopt.control.loops.sampled_plant import find_rest, sample
-from seaopt.control.running.outer_run import enclose_controller
+from seaopt.control.loops.sampled_plant import find_rest
+from seaopt.control.running.outer_run import close, enclose
 from seaopt.errors import ControlError
 from seaopt.executors import Shared
 from seaopt.parameters import Parameter, ParameterSet
@@ -236,39 +236,21 @@ def find_radius(
     """Return the largest eigenvalue of the sampled loop, sliding, with further feedback. `weight` feeds the reference
     by the link's position, `ripple` the effort by the motor's: each an output and a slope.
     """
-    law, signals, per_reference = runnable(controller), list(controller.signals), 1.0
-    if controller.outer is not None and plant.port is not None and plant.port.motion in plant.outputs:
-        law, read = enclose_controller(controller, str(plant.port.motion))
-        signals = list(read)
-        per_reference = controller.outer.direction * controller.outer.stiffness
-    n = law.c.size
-    b, d = np.reshape(law.b_measurement, (n, law.measured)).copy(), np.ravel(law.d_measurement).copy()
+    law, signals = enclose(controller, plant)
+    b, d = law.b, law.d
     for reads, _ in filter(None, (weight, ripple)):
         if reads not in signals:
-            signals.append(reads)
-            b, d = np.hstack([b, np.zeros((n, 1))]), np.append(d, 0.0)
-    if weight is not None:
-        column, slope = signals.index(weight[0]), weight[1] / per_reference
-        b[:, column] -= law.b_reference * slope
-        d[column] -= law.d_reference * slope
+            signals = (*signals, reads)
+            b, d = np.column_stack([b, np.zeros(law.c.size)]), np.append(d, 0.0)
+    b, d = b.copy(), d.copy()
+    if weight is not None:  # of the force law's reference
+        column, force_law = 1 + signals.index(weight[0]), controller.law
+        b[: force_law.c.size, column] += weight[1] * force_law.b[:, 0]
+        d[column] += weight[1] * force_law.d[0]
     if ripple is not None:
-        d[signals.index(ripple[0])] -= ripple[1]
-    whole = Law(
-        a=law.a,
-        b=np.column_stack([law.b_reference, -b]),
-        c=law.c,
-        d=np.append(law.d_reference, -d),
-        sample_time_s=law.sample_time_s,
-    )
-    sampled = sample(
-        take_sliding(plant, params),
-        controller.delay(params),
-        tuple(signals),
-        controller.command.per_effort,
-        law.sample_time_s,
-        controller.compute_delay_samples,
-    )
-    return float(np.max(np.abs(Loop(plant=sampled, law=whole).eigenvalues())))
+        d[1 + signals.index(ripple[0])] += ripple[1]
+    loop = close(controller, take_sliding(plant, params), params, (replace(law, b=b, d=d), signals))
+    return float(np.max(np.abs(loop.eigenvalues())))
 
 
 def _read_position(plant: Plant, params: ParameterSet, output: str) -> float:

@@ -40,6 +40,7 @@ from seaopt.control import (
 )
 from seaopt.control.laws.delay import DELAY_KEYS
 from seaopt.control.laws.structures import CUSTOM
+from seaopt.control.loops.outer_loop import FIRST, follow_link
 from seaopt.control.loops.sampled_plant import DELAYS, conditions, find_delay, read_conditions, whole_samples
 from seaopt.control.mpc.active_set import UNFINISHED
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
@@ -56,7 +57,7 @@ from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, requ
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.robustness.verification.judgement import LINE_SIGMAS, find_noise_floor
-from seaopt.robustness.verification.linear import view_loop
+from seaopt.robustness.verification.linear import LinearView, view_loop
 from seaopt.robustness.verification.oscillation import Oscillation, Signal, measure_swing
 from seaopt.robustness.verification.playback import Stage
 from seaopt.units import LINEAR
@@ -68,6 +69,7 @@ PERIODS, LEAST_PHASE_S, REST_S = 3.0, 0.1, 0.02  # of the bandwidth that a phase
 JUDGED_PERIODS = 8.0  # of the bandwidth that the last phase lasts besides, in which a ring would last
 SLOWEST = 0.5  # of the bandwidth: slower rings, of the linear law, are looked for in its own simulations
 LAST_SHARE, SETTLED = 0.2, 0.1  # of a phase, over which the force is off by at most this share of the step
+FORGOTTEN = 1e-3  # of a mode, that is left after a sample
 RUNAWAY, GROWTH = 3.0, 1.5  # times what the limits hold; second half of the last phase over its first
 CONSTRAINED_FAILURES, CONSTRAINED_PROBABILITY = "constrained_failures", "constrained_failure_probability"
 RUN_SECONDS = 0.35  # that a run on a plant takes as a rule
@@ -293,23 +295,32 @@ class _Case:
         return _Outcome(kind=kind, text=text, violation=violation, signal=signal, ring=ring, at_limit=at_limit)
 
     def _simulate(self, steps: list[MPCStep]) -> ForceRun:
-        """Return the samples of the run, and add each step of the law to `steps`."""
+        """Return the samples of the run, and add each step of the law to `steps`. An outer loop is given the x_0 that
+        its stiffness makes the reference of, and asks for the force of one sample: with it there is no preview.
+        """
         mpc = self.bench.mpc
+        outer = mpc.outer if self.bench.law.renders else None
+        moved = outer is not None and outer.position in self.plant.outputs
 
-        def law(state: Any, r: Any, y: float) -> tuple[float, Any]:
-            steps.append(mpc.step(state, r, y))
-            return steps[-1].current_A, steps[-1].state
+        def law(state: Any, r: Any, y: Any) -> tuple[float, Any]:
+            plan, kept = state
+            if outer is not None:
+                y, position = y if moved else (y, 0.0)
+                kept = follow_link(outer.numbers, kept, r / (outer.direction * outer.stiffness), float(position))
+                r = kept[-1]
+            steps.append(mpc.step(plan, r, float(y)))
+            return steps[-1].current_A, (steps[-1].state, kept)
 
         return close_loop(
             law,
-            mpc.start,
+            (mpc.start, FIRST),
             self.plant,
             self.values,
             self.drawn.reference,
-            measured=mpc.measured,
+            measured=(mpc.measured, outer.position) if outer is not None and moved else mpc.measured,
             sample_time_s=mpc.sample_time_s,
             delay_samples=mpc.compute_delay_samples,
-            preview_samples=mpc.spec.preview_samples,
+            preview_samples=mpc.spec.preview_samples if outer is None else 0,
             sensors=self.bench.sensors,
             command_step=self.bench.command_step,
             command_limit=mpc.command_limit,
@@ -345,29 +356,45 @@ class _Case:
         therefore no fault only where the same run on ideal devices has as much of it.
         """
         bench = self.bench
-        swing = _measure_ring(bench.mpc, run)
+        stage = Stage(controller=bench.law, plant=self.plant, sensors=bench.sensors, command_step=bench.command_step)
+        view = view_loop(stage, self.plant, self.values)
+        swing = self._measure_ring(run, view)
         fading = not (swing.sustained or swing.growing)
         if fading and bench.is_ideal:
             return 0.0, ""
-        stage = Stage(controller=bench.law, plant=self.plant, sensors=bench.sensors, command_step=bench.command_step)
-        view = view_loop(stage, self.plant, self.values)
         floor = find_noise_floor(stage, float(np.max(np.abs(run.force))))
         if not view.instability:
             floor = max(floor, LINE_SIGMAS * view.force_std(SLOWEST * bench.mpc.spec.bandwidth_hz))
         if swing.amplitude <= floor:
             return swing.peak, ""
-        if fading and not self._rings_by_devices(swing.amplitude):
+        if fading and not self._rings_by_devices(swing.amplitude, view):
             return 0.0, ""
         what = f"an oscillation of {swing.amplitude:.3g} {run.unit}, at {swing.frequency_hz:.3g} Hz most, "
         return swing.peak, f"{what}does not die out; noise and rounding explain {floor:.3g} {run.unit}"
 
-    def _rings_by_devices(self, amplitude: float) -> bool:
+    def _rings_by_devices(self, amplitude: float, view: LinearView) -> bool:
         """Tell whether most of what swings is gone with ideal devices, so that it is no transient of the loop."""
         try:
             ideal = replace(self, bench=self.bench.ideal)._simulate([])
         except SeaoptError:
             return False
-        return _measure_ring(self.bench.mpc, ideal).amplitude < 0.5 * amplitude
+        return self._measure_ring(ideal, view).amplitude < 0.5 * amplitude
+
+    def _measure_ring(self, run: ForceRun, view: LinearView) -> Oscillation:
+        """Return what swings at the end of a run; without the slow modes of a link that an outer loop makes swing, of
+        which the ends of a window make fast ones.
+        """
+        mpc, lowest_hz = self.bench.mpc, SLOWEST * self.bench.mpc.spec.bandwidth_hz
+        judged = round(JUDGED_PERIODS / mpc.spec.bandwidth_hz * mpc.spec.sample_rate_hz)
+        force = run.force[-judged:]
+        if self.bench.law.renders:
+            poles = view.loop.eigenvalues()
+            rates: Any = np.log(poles[np.abs(poles) > FORGOTTEN])
+            slow = rates[(rates.imag >= 0.0) & (rates.imag < 2.0 * np.pi * lowest_hz * mpc.sample_time_s)]
+            modes: Any = np.exp(np.outer(np.arange(judged), slow))
+            basis = np.hstack([modes.real, modes.imag, np.ones((judged, 1))])
+            force = force - basis @ np.linalg.lstsq(basis, force, rcond=None)[0]
+        return measure_swing(force, mpc.sample_time_s, lowest_hz=lowest_hz)
 
     def _find_violation(self, run: ForceRun) -> tuple[float, str]:
         """Return by how much a bounded signal leaves its bounds at most, over half their width, and which it is."""
@@ -536,12 +563,6 @@ def _name_obstacle(mpc: ForceMPC, failed: _Outcome) -> str:
     low, high = mpc.spec.bounds[failed.signal]
     more = 0.5 * (high - low) * failed.violation
     return f"bounds of {failed.signal} wider than [{low - more:.3g}, {high + more:.3g}] in [mpc], or bound_tolerance"
-
-
-def _measure_ring(mpc: ForceMPC, run: ForceRun) -> Oscillation:
-    """Return what swings at the end of a run."""
-    judged = round(JUDGED_PERIODS / mpc.spec.bandwidth_hz * mpc.spec.sample_rate_hz)
-    return measure_swing(run.force[-judged:], mpc.sample_time_s, lowest_hz=SLOWEST * mpc.spec.bandwidth_hz)
 
 
 def _has(plant: Plant, name: str) -> bool:

@@ -138,6 +138,8 @@ def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
     assert controller.outer is not None
     moving = [name for name, plant in models.items() if plant.port is not None and plant.port.motion is not None]
     name = controller.outer.plant or next(iter(moving), "")
+    if not controller.outer.position:
+        raise ControlError("impedance: its position, the output that it reads, is not given; tune again")
     if name not in moving:
         raise ControlError(
             f'the impedance is rendered at the link of plant "{name}", which is not one of the certified plants whose '

@@ -50,7 +50,6 @@ from seaopt.robustness.verification.schedule_motion import Motion, describe_moti
 from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps, find_fastest, sweep_schedule
 from seaopt.units import unit_after
 
-OUTER = "sweeps are of the force law: the impedance's outer loop is judged with the variable standing still"
 MOTION_RATE = "min_motion_rate"
 BOUND, SWEEP = 0.2, 5.0  # seconds that a stretch, and the sweeps of a plant, take as a rule
 
@@ -145,8 +144,7 @@ class ScheduleCertificate(Result, Worded):
             for note in said[value]
             if note not in shared
         )
-        outer = (OUTER,) if self.schedule.controllers[0].outer is not None and self.sweeps else ()
-        return (self.proof, self.assumption, *swept, *moved, *outer, *shared, *at_points)
+        return (self.proof, self.assumption, *swept, *moved, *shared, *at_points)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of robustness.json (schema seaopt/robustness/3), with its digest."""

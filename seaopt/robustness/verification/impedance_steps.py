@@ -8,7 +8,6 @@ rest. Friction may hold it short of where it should end, so that only rest is re
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -16,8 +15,8 @@ from seaopt.codec import OrInfinite, OrNaN
 from seaopt.control import Controller
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
+from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.outer_run import enclose_controller
 from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -70,13 +69,13 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
     if not outer.stiffness > 0.0:
         return ()
     motion, completed = str(plant.port.motion), plant.complete(params)
-    law, measured = enclose_controller(controller, motion)
-    law = replace(law, gate=None)  # one that gives its sensor up lets the link hang, which would pass for rest
+    # A gate that gives its sensor up lets the link hang, which would pass for rest.
+    law = runnable(controller, gate=False, outer=True)
     params = controller.delay(params)
     loop = SampledLoop(
         plant=plant,
         law=law,
-        measured=measured,
+        measured=controller.signals,
         delay_samples=controller.compute_delay_samples,
         longest_delay_s=find_longest_delay(plant, [params]),
         sticks=can_stick(plant),

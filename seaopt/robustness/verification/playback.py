@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from seaopt.bench import Sensors, excite
 from seaopt.control import Controller
-from seaopt.control.laws.realisation import runnable
+from seaopt.control.laws.realisation import RunnableLaw, runnable
 from seaopt.control.loops.sampled_plant import DELAYS, find_rows
 from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
@@ -49,7 +49,7 @@ class Stage:
             )
         return SampledLoop(
             plant=plant,
-            law=runnable(self.controller),
+            law=self.law,
             measured=self.controller.signals,
             delay_samples=self.controller.compute_delay_samples,
             sensors=self.sensors,
@@ -58,6 +58,11 @@ class Stage:
             sticks=sticks and can_stick(plant),  # bristles hold by themselves
             link=None if self.controller.link is None else self.controller.link.measured,
         )
+
+    @property
+    def law(self) -> RunnableLaw:
+        """The law as exported, with its outer loop."""
+        return runnable(self.controller, outer=True)
 
     @property
     def ideal(self) -> Stage:
@@ -74,7 +79,7 @@ class Stage:
     @property
     def is_ideal(self) -> bool:
         """Whether sensors and amplifier add nothing of their own."""
-        signals = self.controller.signals
+        signals = (*self.controller.signals, *(() if self.law.outer is None else (self.law.outer.position,)))
         sources = {*signals, *(name for signal in signals for name in weigh_encoders(self.plant, signal))}
         offset = any(self.sensors.offset.get(name) for name in sources)
         return not (self.command_step or offset or any(any(self.find_errors(name)) for name in signals))
@@ -105,7 +110,7 @@ class Playback:
     """The samples of a simulated scenario."""
 
     time: Signal
-    reference: RunSamples  # N
+    reference: RunSamples  # N, of the force law: with an outer loop what that asks of it where the link is
     current: RunSamples  # A
     outputs: Mapping[str, RunSamples]  # and "energy" where declared; NaN while a held link has no such output
     peaks: Mapping[str, Float[np.ndarray, " runs"]]  # largest magnitudes, between samples too
@@ -135,7 +140,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     its parameters (an angle such as phi) puts the plant, with the law and the commands that wait at rest too, and the
     scenario's forces counted from the one that keeps it there. A scenario with an `initial_state` starts in that,
     whatever the conditions. `delay_s` among the parameters is a delay besides the controller's. `seed` is of the sensor
-    noise and of random excitations.
+    noise and of random excitations. Around an outer loop a force of a phase is the x_0 that its stiffness makes it of.
     """
     obstacle = scenario.obstacle(stage.plant, stage.partner)
     if obstacle is not None:
@@ -148,8 +153,11 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     carried = [drawn.with_parameters(*delay) for drawn, delay in zip(placed, delays, strict=True)]
     rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), placed)
     now, grip = _start_state(stage, scenario, placed, longest) if rest is None else rest.state, None
-    offset = rest.reference[:, None] if rest is not None and scenario.about_rest else np.zeros((len(params), 1))
+    offset = rest.given[:, None] if rest is not None and scenario.about_rest else np.zeros((len(params), 1))
+    outer = stage.law.outer
+    per_force = 1.0 if outer is None else 1.0 / (outer.direction * outer.stiffness)
     runs: list[LoopRun] = []
+    positions: list[RunSamples] = []  # of the link, as the outer loop reads it
     contacts: list[Contact] = []
     begin_s = 0.0
     for number, phase in enumerate(scenario.phases):
@@ -167,9 +175,10 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             blows = [strike(stage.plant, p, x, link, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
             now = LoopState(x=np.stack(blows), z=now.z)
         loop = stage.loop(phase.held, longest, sticks=scenario.friction == "sticking")
-        reference = offset + _build_reference(
+        reference = offset + per_force * _build_reference(
             phase, loop.law.sample_time_s, np.random.default_rng([require_seed(seed, ControlError), number])
         )
+        standing = np.zeros((1, 0)) if grip is None else _read_standing(stage, values, grip, loop.standing)
         run = run_loop(
             loop,
             values,
@@ -177,11 +186,15 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             start=now,
             seed=seed + 7919 * number,
             start_s=begin_s,
-            standing=0.0 if grip is None else _read_standing(stage, values, grip, loop.standing),
+            standing=standing if standing.size else 0.0,
         )
         now, begin_s = run.end, begin_s + reference.shape[1] * loop.law.sample_time_s
         runs.append(run)
-    return _join_phases(stage, runs, rest, tuple(contacts))
+        if outer is not None:
+            still = dict(zip(loop.standing, standing.T, strict=False)).get(outer.position, np.zeros(1))
+            positions.append(run.outputs.get(outer.position, np.broadcast_to(still[:, None], run.reference.shape)))
+    played = _join_phases(stage, runs, rest, tuple(contacts))
+    return played if outer is None else replace(played, reference=outer.run(played.reference, np.hstack(positions)))
 
 
 def _start_state(stage: Stage, scenario: Scenario, values: Sequence[CompletedParameters], longest: float) -> LoopState:
@@ -262,7 +275,7 @@ def _join_phases(
         rest=rest,
         edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
         contacts=contacts,
-        faulted=find_faults(runnable(stage.controller), runs[-1].end.z),
+        faulted=find_faults(stage.law, runs[-1].end.z),
         error=max(run.error for run in runs),
         command=runs[0].command,
         substeps=max(run.substeps for run in runs),

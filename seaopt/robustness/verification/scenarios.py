@@ -14,6 +14,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.limits import BY_NAME, STEADY, STEADY_PERIODS
 from seaopt.control.laws.realisation import RunnableLaw, runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
+from seaopt.control.running.outer_run import close, enclose
 from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
@@ -238,7 +239,9 @@ def default_scenarios(controller: Controller, plant: Plant, sets: Sequence[Param
         heavy, light = (dict.fromkeys(plant.port.payload, factor) for factor in (1.5, 1 / 1.5))
         add("payload", push, Phase(duration_s=lasting, scale=heavy), Phase(duration_s=tail, scale=light), on="free")
     angle = _lever(plant)
-    if angle is not None:  # let go above the horizontal: the arm L_a cos(phi) vanishes at 90 degrees and changes sign
+    # Let go above the horizontal: the arm L_a cos(phi) vanishes at 90 degrees and changes sign. One that an outer loop
+    # pulls on does not fall.
+    if angle is not None and not controller.renders:
         start, horizontal = {angle: math.radians(FALL_DEG)}, {angle: math.pi / 2}
         fall = Phase(duration_s=2.0 * tail)
         add("fall through 90 deg", fall, initial_state=start, passes=horizontal, quiet=False, on="free")
@@ -360,7 +363,7 @@ def build_loop(
     """Return a controller's loop on a nonlinear plant, with ideal devices; `law` runs in place of its own."""
     return SampledLoop(
         plant=plant,
-        law=law or runnable(controller),
+        law=law or runnable(controller, outer=True),
         measured=controller.signals,
         delay_samples=controller.compute_delay_samples,
         longest_delay_s=find_longest_delay(plant, [params]),
@@ -411,7 +414,8 @@ def _lever(plant: Plant) -> str | None:
 
 def _size_last_phase(controller: Controller, plant: Plant) -> float:
     """Return the duration of a last phase: long enough for the loop's slowest swing, and for slow limit cycles."""
-    loop = controller.close(plant, _require_design(controller)[1])
+    _, params = _require_design(controller)
+    loop = close(controller, take_sliding(plant, params), params, enclose(controller, plant))
     poles = np.log(loop.eigenvalues() + 1e-300) / controller.sample_time_s
     swinging = np.abs(poles.imag[np.abs(poles.imag) > np.abs(poles.real)])
     slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0

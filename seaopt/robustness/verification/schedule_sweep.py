@@ -6,7 +6,8 @@ The limits of a schedule are judged with the variable standing still. Here it mo
 
 through the whole table and back, at a peak rate of :math:`\tfrac12 (s_1 - s_0)\,\omega`: in place of a parameter, or in
 place of a state, whose own rate then is ds/dt. The law runs as it is exported, and reads s in the same sample as the
-regulated output.
+regulated output. Where an outer loop is around it, its x_0 goes with a link that is moved so, and pulses are of the
+force that its stiffness makes of x_0.
 
 Each sweep is simulated twice, with pulses of the reference and without, and what is judged is the difference: the
 motion itself stretches the spring, which disturbs every law alike. The difference must keep the reference peak that a
@@ -31,6 +32,7 @@ import numpy as np
 
 from seaopt.codec import OrInfinite
 from seaopt.control.loops.compensation.terms import FORGOTTEN
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, run_loop
 from seaopt.control.running.law_step import find_faults, list_kept
@@ -255,7 +257,7 @@ class RestStart:
         `places` are for a plant that does not have the variable. Raises SimulationError: to hold it there takes
         more than the command's limit.
         """
-        law, value = self.schedule.runnable(), self.value
+        law, value = self.schedule.runnable(outer=True), self.value
         if abs(self.command) > law.command_limit:
             needed, limit = (show_command(value, *law.command) for value in (abs(self.command), law.command_limit))
             raise SimulationError(
@@ -273,15 +275,23 @@ class RestStart:
         named = {self.schedule.over: value} | self.readings
         further = [named.get(name, 0.0) for name in law.further]
         reference = float(fed[0]) - _weigh(law, named, value)
+        given = reference + references
+        if law.outer is not None:
+            per_force = 1.0 / (law.outer.direction * law.outer.stiffness)
+            reference = per_force * reference + self.readings.get(law.outer.position, 0.0)
+            given = reference + per_force * references + _travel(plant, law.outer, values, references.shape[1])
         kept = list_kept(law, law.reset(reference, fed, value, self.command, readings=further))
         x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]
         count = len(references)
         start = LoopState(x=np.tile(x, (count, 1)), z=np.tile(z, (count, 1)))
-        return run_loop(loop, [values] * count, reference + references, start=start, places=places)
+        return run_loop(loop, [values] * count, given, start=start, places=places)
 
     def find_errors(self, run: LoopRun, places: Signal) -> Rows:
         """Return how far the output is from what the law follows, the weight that it compensates included."""
-        law, errors = self.schedule.runnable(), run.outputs[self.regulated] - run.reference
+        law, followed = self.schedule.runnable(outer=True), run.reference
+        if law.outer is not None:
+            followed = law.outer.run(followed, run.outputs.get(law.outer.position, np.zeros_like(followed)))
+        errors = run.outputs[self.regulated] - followed
         if law.compensation is None or law.compensation.gravity is None:
             return errors
         name = law.compensation.gravity.reads
@@ -291,6 +301,18 @@ class RestStart:
             for row in read.tolist()
         ]
         return errors - np.array(rows)
+
+
+def _travel(plant: Plant, outer: OuterLoop, values: ParameterSet, samples: int) -> Signal:
+    """Return how far a sweep moves the link's position at each sample; zero of a link that is not moved by it."""
+    names = list(plant.outputs)
+    position = plant.output[names.index(outer.position)] if outer.position in names else ca.SX(0)
+    if ca.depends_on(position, ca.vertcat(plant.x, plant.u)):
+        return np.zeros(samples)
+    read = ca.Function("position", [plant.t, plant.p], [position])
+    times = outer.sample_time_s * np.arange(samples)
+    path = np.array(read(times[None], plant.complete(values).vector)).ravel()
+    return path - path[0]
 
 
 def _weigh(law: RunnableSchedule, readings: Mapping[str, float], place: float) -> float:

@@ -355,7 +355,8 @@ def check_plants(plants: Plants, draws: Mapping[str, Any], partners: Plants) -> 
 
 def list_readings(controller: Controller, plants: Plants) -> list[str]:
     """Return the signals whose sensors' errors are in the runs: what the law reads, and encoders that make it."""
-    named = [*controller.signals, *controller.further]
+    outer = controller.outer
+    named = [*controller.signals, *controller.further, *(() if outer is None else (outer.position,))]
     seen = [controller.see(plant) for plant in plants.values()]
     encoders = (
         name for plant in seen for signal in named if signal in plant.outputs for name in weigh_encoders(plant, signal)

@@ -23,7 +23,6 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.running import closed_loop
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.outer_run import enclose_law
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
 from seaopt.plants.motor.heat_guard import HeatGuard
 from tests.c_code import STRICT
@@ -93,15 +92,18 @@ def change_terms(terms, rng):
 
 def draw_part(number, rng):
     """Return a law, the same with random parts and limit, and its outer loop or None; `number`: of its structure."""
-    shape = np.random.default_rng(number)
-    outer = OuterLoop(
-        stiffness=rng.uniform(100, 2000), damping=rng.uniform(0, 20), velocity_filter_s=rng.choice([0.0, 0.004]),
-        direction=float(rng.choice([-1.0, 1.0])), sample_time_s=TS, place_unit="m",
-    )  # fmt: skip
+    shape, outer = np.random.default_rng(number), draw_outer(rng)
     outer = outer if shape.random() < 0.3 else None
     guards = draw_guards(shape, rng)
     source, terms = draw_law(shape, rng), draw_terms(shape, rng, outer)
     return source, realise(source, per_effort=PER_EFFORT, compensation=terms, **guards), outer
+
+
+def draw_outer(rng):
+    return OuterLoop(
+        stiffness=rng.uniform(100, 2000), damping=rng.uniform(0, 20), velocity_filter_s=rng.choice([0.0, 0.004]),
+        direction=float(rng.choice([-1.0, 1.0])), sample_time_s=TS, place_unit="m", position="x",
+    )  # fmt: skip
 
 
 def draw_guards(shape, rng):
@@ -155,17 +157,17 @@ def draw_schedule(number, rng):
     return make_runnable(table, per_effort=PER_EFFORT, limit=guards.pop("command_limit"), compensations=made, **guards)
 
 
-def draw_signals(rng, names, clean):
-    """Return a reference and readings by name, with steps, spikes, numbers that are none, and outages."""
+def draw_signals(rng, names, placed):
+    """Return a reference and readings by name, with steps, spikes, numbers that are none, and outages. `placed`: the
+    reference is a position.
+    """
     rows = dict(zip(["reference", *names], lfilter([0.05], [1, -0.95], rng.normal(size=(9, SAMPLES))), strict=False))
     for name, row in rows.items():
-        row *= 0.9 if name in "qx" or (name == "reference" and clean) else 900.0
-        row[200:] += 0.8 * (name == "reference") * (1.0 if clean else 1e3)
-        if not clean or name in clean:
-            row[rng.integers(5, SAMPLES, 6)] = rng.choice([np.nan, np.inf, -np.inf, 2e15, -3e3, 700.0], 6)
-            first = rng.integers(SAMPLES // 2, SAMPLES)
-            row[first : first + rng.integers(1, 9)] = np.nan
-        row[:2] = [0.0, 0.1 * rng.normal()]  # an outer loop takes the first position for one at rest
+        row *= 0.9 if name in "qx" or (name == "reference" and placed) else 900.0
+        row[200:] += 0.8 * (name == "reference") * (1.0 if placed else 1e3)
+        row[rng.integers(0, SAMPLES, 6)] = rng.choice([np.nan, np.inf, -np.inf, 2e15, -3e3, 700.0], 6)
+        first = rng.integers(SAMPLES // 2, SAMPLES)
+        row[first : first + rng.integers(1, 9)] = np.nan
     return rows
 
 
@@ -227,18 +229,16 @@ def dict_of(controller):
 def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tuned, tmp_path, monkeypatch):
     rng, plant = np.random.default_rng(count), make_plant()
     parts = [draw_part(number % STRUCTURES, rng) for number in range(count)]
-    parts += [(None, draw_schedule((33 + number) % (STRUCTURES // 2), rng), None) for number in range(count // 2)]
+    parts += [
+        (None, draw_schedule((33 + number) % (STRUCTURES // 2), rng), draw_outer(rng) if number % 3 == 0 else None)
+        for number in range(count // 2)
+    ]
     play_c = export_all(compiler, parts, tuned, tmp_path, monkeypatch)
     saturated, differing = 0, 0
     for number, (_, force_law, outer) in enumerate(parts):
-        names, law, places = ("F", "G", "H")[: force_law.measured], force_law, None
-        fed_back = names if outer is None else (*names, "x")
-        if outer is not None:
-            law = enclose_law(force_law, outer)
-        loop = SampledLoop(plant=plant, law=law, measured=fed_back, delay_samples=0)
-        # An outer loop whose position fails goes on with its last reference, which only the exported code knows.
-        clean = () if outer is None else ("F" if law.gate else "-",)
-        signals = draw_signals(rng, loop.signals, clean)
+        names, law, places = ("F", "G", "H")[: force_law.measured], replace(force_law, outer=outer), None
+        loop = SampledLoop(plant=plant, law=law, measured=names, delay_samples=0)
+        signals = draw_signals(rng, loop.signals, outer is not None)
         reference, *noise = signals.values()
         if isinstance(law, RunnableSchedule):
             places = 1.5 * np.sin(0.03 * np.arange(SAMPLES) + rng.uniform(0.0, 6.0))
@@ -246,12 +246,13 @@ def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tune
         monkeypatch.setattr(closed_loop, "_noise", lambda *_, noise=noise: np.array(noise).T[None].copy())
         run = run_loop(loop, [so.ParameterSet()], reference, places=np.nan if places is None else places)
         readings = {name: run.outputs[name][0] + signals[name] for name in loop.signals}
-        measured, further = ([readings[name] for name in part] for part in (fed_back, law.further))
+        measured, further = ([readings[name] for name in part] for part in (names, law.further))
         commands, largest = play_python(law, reference, measured, further, places)
         scale = 1e-12 * largest
         np.testing.assert_allclose(run.current[0], commands, rtol=0, atol=scale, err_msg=f"compiled loop, law {number}")
-        inputs = [reference, *measured[: len(names)], *further, *measured[len(names) :]]
+        inputs = [reference, *measured, *(readings[name] for name in force_law.further)]
         inputs += [] if places is None else [places]
+        inputs += [] if outer is None else [readings["x"]]
         np.testing.assert_allclose(play_c(number, inputs), commands, rtol=0, atol=scale, err_msg=f"C, law {number}")
         saturated += bool(np.any(np.abs(commands) >= law.command_limit * (1 - 1e-9)))
         differing += np.unique(commands).size > SAMPLES // 2

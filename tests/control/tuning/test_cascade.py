@@ -21,7 +21,7 @@ from seaopt.control.laws.structures import Gains, InnerLoop, Prefilter, SpeedLoo
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import sample
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.outer_run import enclose_law
+from seaopt.control.running.outer_run import enclose
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.reporting.sections.kinds.controller import list_achieved
@@ -342,9 +342,8 @@ def test_an_impedance_around_it_is_the_one_integrated_here(tuned: Controller) ->
     """Stiffness and damping of the link, each sample: K (x_0 - x) less D times its filtered speed."""
     whole = add_impedance(tuned, SWING, VALUES, Impedance(stiffness=20.0, damping=1.5))
     assert whole.outer is not None
-    law = enclose_law(runnable(whole), whole.outer)
-    assert law.measured == 3
-    loop = SampledLoop(plant=SWING, law=law, measured=(*whole.signals, "theta_l"), delay_samples=1)
+    assert enclose(whole, SWING)[1] == (*whole.signals, "theta_l")
+    loop = SampledLoop(plant=SWING, law=runnable(whole, outer=True), measured=whole.signals, delay_samples=1)
     run = run_loop(loop, [VALUES], np.full(300, 0.2))
     _, found = simulate_by_hand(dict(tuned.gains), np.full(300, 0.2), True, (20.0, 1.5))
     np.testing.assert_allclose(run.outputs["theta_l"][0], found, atol=2e-4 * np.ptp(found))
@@ -371,8 +370,8 @@ def test_what_the_link_feels_of_an_impedance_around_it_is_the_equations(tuned: C
     moved = close_link(link, 1e-3)
     path = moved.step(Impedance(stiffness=outer[0], damping=outer[1]), 200)
     smooth = VALUES.update(f_c=0.0)
-    law_whole = enclose_law(runnable(add_impedance(tuned, SWING, smooth, whole.impedance)), whole)
-    loop = SampledLoop(plant=SWING, law=law_whole, measured=(*tuned.signals, "theta_l"), delay_samples=1)
+    law_whole = runnable(add_impedance(tuned, SWING, smooth, whole.impedance), outer=True)
+    loop = SampledLoop(plant=SWING, law=law_whole, measured=tuned.signals, delay_samples=1)
     run = run_loop(loop, [smooth], np.full(200, 1e-4))
     np.testing.assert_allclose(path, run.outputs["theta_l"][0] * 1e4, atol=1e-4 * np.max(path))
 

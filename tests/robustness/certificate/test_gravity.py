@@ -72,10 +72,7 @@ def test_certificate_requires_it(plain):
 
 
 def test_an_impedance_stands_where_it_is_asked_to(plain):
-    from seaopt.control.running.outer_run import enclose_law
-
     stiff = compensate(add_impedance(plain, KNEE, VALUES, Impedance(stiffness=20.0, damping=1.0)), 1.0)
-    law = enclose_law(runnable(stiff), stiff.outer)
-    loop = SampledLoop(plant=KNEE, law=law, measured=("tau_s", "theta_l"), delay_samples=1)
+    loop = SampledLoop(plant=KNEE, law=runnable(stiff, outer=True), measured="tau_s", delay_samples=1)
     ends = run_loop(loop, [VALUES], np.full(4000, 0.6)).outputs["theta_l"][0]
     assert ends[-1] == pytest.approx(0.6, abs=2e-3)  # 20 N m/rad against 4.4 N m: without it 0.45

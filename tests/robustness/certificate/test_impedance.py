@@ -12,7 +12,6 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import Impedance, add_impedance, critical_impedance, render
 from seaopt.control.laws.realisation import runnable
-from seaopt.control.running.outer_run import enclose_law
 from seaopt.files import to_json
 from seaopt.problem.stages import tune_problem
 from seaopt.robustness import Certificate
@@ -147,17 +146,17 @@ def test_a_simulated_step_is_that_of_the_equations(certificate):
 
 def test_one_law_runs_as_force_law_and_outer_loop_do(force):
     controller = add_impedance(force, FREE, VALUES, Impedance(stiffness=40.0, damping=2.0), name="free")
-    law = runnable(controller, command_limit=2.0)
+    law, whole = (runnable(controller, command_limit=2.0, outer=outer) for outer in (False, True))
     rng = np.random.default_rng(3)
     wanted, torque, place = rng.normal(size=(3, 200)) * np.array([[0.02], [0.5], [0.001]])
-    together, _ = enclose_law(law, controller.outer).run(wanted, np.column_stack([torque, place]))
-    state, filtered, apart = law.reset(), controller.outer.reset(0.0), []
+    together, _ = whole.run(wanted, torque, whole.reset(0.0, readings=[0.0]), place[:, None])
+    state, filtered, apart = law.reset(), controller.outer.reset(place[0]), []
     for k in range(200):
         reference, filtered = controller.outer.step(filtered, wanted[k], place[k])
         current, state = law.step(state, reference, torque[k])
         apart.append(current)
     assert np.max(np.abs(apart)) == 2.0 and np.min(np.abs(apart)) < 1.0
-    assert together == pytest.approx(np.array(apart), rel=1e-9, abs=1e-9)
+    assert together == pytest.approx(np.array(apart), rel=1e-12, abs=1e-12)
 
 
 def write(folder, plant="free", damping="2.0"):

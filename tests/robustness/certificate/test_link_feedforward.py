@@ -20,8 +20,9 @@ from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.rendering import apparent_impedance, render
 from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.outer_run import enclose_controller
+from seaopt.control.running.outer_run import enclose
 from seaopt.errors import ControlError
 from seaopt.robustness.verification.playback import play
 from seaopt.robustness.verification.scenarios import Phase, Scenario
@@ -305,9 +306,8 @@ def test_a_step_of_the_impedance_is_the_one_made_here(rendering: Controller) -> 
     assert abs(expected[-1] - 1.0) < 0.2
     moved = close_link(find_link(rendering, SWING, DAMPED), TS).step(ASKED, 400)
     np.testing.assert_allclose(moved, expected, atol=1e-6)
-    law, measured = enclose_controller(rendering, "x_2")
-    assert measured == ("F1", "x_2")
-    loop = SampledLoop(plant=SWING, law=law, measured=measured, delay_samples=1)
+    assert enclose(rendering, SWING)[1] == ("F1", "x_2")
+    loop = SampledLoop(plant=SWING, law=runnable(rendering, outer=True), measured=rendering.signals, delay_samples=1)
     played = run_loop(loop, [DAMPED], np.full(400, 1e-5)).outputs["x_2"][0]
     np.testing.assert_allclose(played * 1e5, expected, atol=1e-4)
 

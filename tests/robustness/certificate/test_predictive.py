@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -10,12 +11,13 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, runnable
+from seaopt.control import Impedance, MPCSpec, NoiseModel, add_impedance, close_loop, force_mpc, runnable
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
 from seaopt.robustness import linear_controller
+from seaopt.robustness.certificate import constrained
 
 TS = 1e-3
 SPEED_LIMIT = {"qd": (-0.08, 0.08)}
@@ -218,3 +220,24 @@ def test_what_cannot_be_is_said_in_one_line(mpc, stand, thor):
     for options, said in (({"runs": 0}, "runs = 0"), ({"bound_tolerance": -1.0}, "bound_tolerance = -1")):
         with pytest.raises(ControlError, match=said):
             so.certify(mpc, {"stand": stand}, thor, **options)
+
+
+def test_runs_with_limits_active_have_the_outer_loop(monkeypatch):
+    """Each command is that of the plan, of the force that stiffness and damping ask where the link of the run was."""
+    held, free = so.plants.rotary("locked"), so.plants.rotary()
+    values = free.defaults.update(N=100.0, K_tau=0.0369, eta=0.7, J_m=2.4e-5, b_r=1e-4, k_s=300.0, J_l=0.25, d_l=0.3)
+    mpc = force_mpc(held, values, MPCSpec(measured="tau_s", current_limit_A=8.0, bandwidth_hz=12, preview_samples=5))
+    asked = Impedance(stiffness=40.0, damping=2.0, velocity_filter_s=5e-3)
+    mpc = replace(mpc, outer=add_impedance(linear_controller(mpc), free, values, asked, name="free").outer)
+    runs, play = [], constrained.close_loop
+    monkeypatch.setattr(constrained, "close_loop", lambda *a, **k: runs.append(play(*a, **k)) or runs[-1])
+    checked = so.certify(mpc, {"free": free}, values, samples=2, runs=1)
+    assert checked.constrained.failures == 0
+    run = next(run for run in runs if run.state.shape[1] == len(free.states))
+    places = run.state[:, list(free.states).index("theta_l")]
+    assert np.ptp(places) > 0.1
+    state, before, speed = mpc.start, places[0], 0.0
+    for wanted, place, torque, current in zip(run.reference, places, run.force, run.current, strict=True):
+        speed, before = (5e-3 * speed + place - before) / (5e-3 + TS), place
+        command, state = mpc.command(state, wanted - 40.0 * place - 2.0 * speed, torque)
+        assert command == pytest.approx(current, abs=1e-9)
