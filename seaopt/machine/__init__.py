@@ -3,8 +3,9 @@
 from seaopt.machine.acceptance import Acceptance, accept
 from seaopt.machine.bringup import Band, BringUp, Stage, bring_up
 from seaopt.machine.bringup_files import write_bring_up
+from seaopt.machine.causes import Cause
 from seaopt.machine.differences import Difference, Differences
-from seaopt.machine.replay import Cause, Replay
+from seaopt.machine.replay import Replay
 from seaopt.machine.response.verdicts import Judged, Response
 
 __all__ = [

@@ -17,9 +17,10 @@ from seaopt.errors import LogError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import join_words
 from seaopt.logs import Log
+from seaopt.machine.causes import Cause
 from seaopt.machine.decimated import shift_command
 from seaopt.machine.differences import Differences, compare
-from seaopt.machine.replay import Cause, Replay, replay
+from seaopt.machine.replay import Replay, replay
 from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import Source, stand

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
+from seaopt.machine.causes import Cause
 from seaopt.machine.differences import Difference, Differences
 from seaopt.machine.figures import list_panels
-from seaopt.machine.replay import Cause, Replay
+from seaopt.machine.replay import Replay
 from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, Judged, Measured, Response
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance

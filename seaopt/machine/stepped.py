@@ -1,8 +1,16 @@
-"""A law of any kind, stepped over the ticks of a log: its commands, its linear form, and states that it may begin in.
+r"""A law of any kind, stepped over the ticks of a log: its commands, its linear form, and states that it may begin in.
 
 A law and a schedule run as in the compiled loop (`seaopt.control.running.law_step`), predictive control by its own
 step. What a state at the first row adds to the commands is taken from the linear form: that of a schedule is the law
 where its variable stands, of predictive control the law while no limit is active.
+
+What a log does not have is the law's state at its first row. Where neither a law at zero nor one at rest under the
+first row goes on as logged, it is taken from the first rows: while the command is within its limit, what a state adds
+to the commands is :math:`C A^k x_0`, which is linear in it.
+
+**What rounding allows.** The logged command is off by up to half its step. A reading that is logged coarser than the
+law saw it, by a step :math:`q`, adds an error of variance :math:`\frac{q^2}{12} \sum_{j \le k} h_j^2` at row k, with
+the law's impulse response h: it grows with the integral. Levels of a reference of steps are no rounding.
 """
 
 from __future__ import annotations
@@ -13,7 +21,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from seaopt.control import (
     Controller,
@@ -26,13 +34,22 @@ from seaopt.control import (
     force_mpc,
     runnable,
 )
+from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.running.law_step import run_law
 from seaopt.errors import SeaoptError
-from seaopt.machine.ticks import Ticks
+from seaopt.logs.quality.faults import find_quantisation
+from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 from seaopt.robustness import linear_controller
 
 SETTLED = 400  # rows over which the estimate of predictive control follows the log
+FLOOR = 1e-3  # of the command's variation: a mismatch below is none
+ROUNDING = 2.0  # times the std that rounding leaves by the estimate: a mismatch up to there is rounding
+HEAD = 400  # rows that tell the state at the first
+HEAD_DECAYS, LONGEST_HEAD = 3.0, 20000  # time constants of the slowest part that they last besides, and rows at most
+INTEGRATES = 1e-6  # distance from 1 of a pole that does not decay
+LEVELS = 200  # of a reference that is taken for rounded; what has fewer is steps
+LONGEST_RESPONSE = 5000  # rows over which an error of rounding is added up
 Source = Controller | ScheduledController | ForceMPC
 State = LawState | MPCState
 
@@ -149,3 +166,140 @@ def limit_law(law: RunnableLaw | RunnableSchedule | ForceMPC, limit: float) -> A
     plant, values = law.design
     spec = replace(law.spec, **{"current_limit_A" if law.spec.current_limit_A is not None else "command_limit": limit})
     return force_mpc(plant, values, spec, gate=law.gate, heat=law.heat)
+
+
+@record(eq=False)
+class Match:
+    """The commands of a replay, what rounding allows at each row, and how far they are from the log's."""
+
+    commands: Float[np.ndarray, " n"]
+    allowed: Float[np.ndarray, " n"]
+    error: Float[np.ndarray, " n"]
+
+    @property
+    def energy(self) -> float:
+        """Mean square of the difference."""
+        return float(np.mean(self.error**2))
+
+    @property
+    def met(self) -> bool:
+        """Whether nothing is left but rounding."""
+        return self.energy <= ROUNDING**2 * float(np.mean(self.allowed**2))
+
+
+def play(setting: Setting) -> Match:
+    """Return the commands of a setting's law on its log."""
+    ticks, linear = setting.ticks, setting.linear
+    head = ticks.take(slice(0, count_head(linear)))
+    allowed = _allow(linear, ticks)
+    allowed_head = allowed[: len(head)]
+    best: tuple[State, int] | None = None
+    error = np.inf
+
+    def starts() -> Iterator[tuple[State, int]]:
+        yield from list_starts(setting)
+        if not isinstance(setting.law, ForceMPC):
+            yield replace(setting.law.reset(), x=_estimate_start(linear, head, allowed_head)), 0
+
+    for start, first in starts():
+        rows = head if not first else ticks.take(slice(first, first + len(head)))
+        off = float(np.mean((run_setting(setting, rows, start) - rows.command) ** 2))
+        if off < error:
+            best, error = (start, first), off
+        if error <= np.mean(allowed_head**2):
+            break
+    assert best is not None
+    start, first = best
+    commands = np.concatenate([ticks.command[:first], run_setting(setting, ticks.take(slice(first, None)), start)])
+    if linear.compensation is not None:  # which differences to a row before the first
+        commands[0] = ticks.command[0]
+    return Match(commands=commands, allowed=allowed, error=commands - ticks.command)
+
+
+def count_head(law: RunnableLaw) -> int:
+    """Return how many rows tell the state at the first: those in which the slowest part of a law decays, too."""
+    size = np.abs(np.linalg.eigvals(law.a)) if law.c.size else np.zeros(0)
+    decays = size[(size > 0.0) & (size < 1.0 - INTEGRATES)]
+    slowest = -1.0 / math.log(float(np.max(decays))) if decays.size else 0.0
+    return int(min(max(HEAD, HEAD_DECAYS * slowest), LONGEST_HEAD))
+
+
+def _drive(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
+    """Return what reference and readings add to the effort at once, and to the next state, at each row."""
+    columns, direct = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
+    reference, added = _compensate(law, ticks)
+    effort = law.d_reference * reference - ticks.measured @ direct + added
+    return effort, np.outer(reference, law.b_reference) - ticks.measured @ columns.T
+
+
+def _compensate(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the reference with what the law's terms add to it, and what they add to the effort, at each row."""
+    if law.compensation is None:
+        return ticks.reference, np.zeros(len(ticks))
+    memory, rows = FORGOTTEN, np.empty((len(ticks), 2))
+    for k, readings in enumerate(ticks.further[:, : len(law.compensation.reads)].tolist()):
+        rows[k, 0], rows[k, 1], memory = law.compensation.step(memory, float(ticks.reference[k]), readings)
+    return rows[:, 0], rows[:, 1]
+
+
+def find_limited(ticks: Ticks) -> Bool[np.ndarray, " n"]:
+    """Tell which logged commands are at a limit: those at the largest magnitude, where several rows in a row are."""
+    size = np.abs(ticks.command)
+    top = size >= AT_LIMIT * np.max(size)
+    return top if np.any(top[1:] & top[:-1]) else np.zeros(size.size, dtype=bool)
+
+
+def find_modes(law: RunnableLaw, limited: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n m"]:
+    """Return what each state at the first row adds to the later commands, with the limit as logged."""
+    rows, moved = np.empty((limited.size, law.c.size)), np.eye(law.c.size)
+    ways = law.a, law.a - np.outer(law.anti_windup, law.c)
+    for k, at_limit in enumerate(limited.tolist()):
+        rows[k] = law.c @ moved
+        moved = ways[at_limit] @ moved
+    return law.per_effort * rows
+
+
+def follow(
+    law: RunnableLaw, ticks: Ticks, limited: Bool[np.ndarray, " n"], share: float = 1.0
+) -> Float[np.ndarray, " n"]:
+    """Return the commands, not limited, of a law that starts from zero and whose limit acts in the rows where it does
+    in the log; with a share of the limit. That is linear in reference, readings and share.
+    """
+    direct, drive = _drive(law, ticks)
+    x, out, most = np.zeros(law.c.size), np.empty(len(ticks)), share * law.force_limit_N
+    signs, at_limit = np.sign(ticks.command), limited.tolist()
+    for k in range(len(ticks)):
+        out[k] = float(law.c @ x) + direct[k]
+        x = law.a @ x + drive[k]
+        if at_limit[k] and math.isfinite(law.force_limit_N):
+            x = x + law.anti_windup * (most * signs[k] - out[k])
+    return law.per_effort * out
+
+
+def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    """Return a state from which the first rows match as well as they can."""
+    limited = find_limited(ticks)
+    if np.count_nonzero(~limited) < 3 * max(law.c.size, 1) or not law.c.size:
+        return np.zeros(law.c.size)
+    left, weight = ticks.command - follow(law, ticks, limited), 1.0 / allowed[~limited]
+    modes = find_modes(law, limited)[~limited] * weight[:, None]
+    return np.linalg.lstsq(modes, left[~limited] * weight, rcond=1e-10)[0]
+
+
+def _allow(law: RunnableLaw, ticks: Ticks) -> Float[np.ndarray, " n"]:
+    """Return one std of what rounding allows at each row."""
+    n = len(ticks)
+    response = find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
+    steps: list[Any] = []
+    if np.unique(ticks.reference).size >= LEVELS:
+        steps.append((law.b_reference, law.d_reference, ticks.reference))
+    columns = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
+    steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i]) for i in range(law.measured)]
+    variance = np.full(n, ticks.quantum**2 / 12.0 + (FLOOR * float(np.std(ticks.command))) ** 2)
+    for b, d, values in steps:
+        quantum = find_quantisation(values)
+        if quantum:
+            impulse = np.concatenate([[law.per_effort * d], response @ b])
+            grown = np.cumsum(impulse**2) * quantum**2 / 12.0
+            variance += grown[np.minimum(np.arange(n), grown.size - 1)]
+    return np.sqrt(np.maximum(variance, np.finfo(float).tiny))

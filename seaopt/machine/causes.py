@@ -1,0 +1,336 @@
+"""Why a law does not make the logged commands, found by trying.
+
+The law or the log is changed by each of a list of causes, and replayed. Factors are found by least squares of the
+logged commands over what reference and readings add to them. Causes are ranked by how much of the mismatch they remove;
+where one removes much and leaves something, a second is looked for behind it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control import Controller, ForceMPC, RunnableSchedule, runnable
+from seaopt.control.laws.structures import LAW_GAINS, Gains
+from seaopt.errors import SeaoptError
+from seaopt.machine.stepped import Match, Setting, count_head, find_limited, find_modes, follow, limit_law, play
+from seaopt.machine.ticks import Ticks
+from seaopt.records import record
+
+LEAST_HEAD = 60  # rows within the limit that factors take
+WINDOW = 2000  # rows on which causes are tried, about the largest mismatch
+EVERY = (2, 3, 4, 5, 10)  # rows per tick of a law that is slower than the logger
+UNITS = tuple(each**power for each in (1e3, 60.0 / (2.0 * math.pi), 180.0 / math.pi, 1e6, 1e2) for power in (-1, 1))
+SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
+MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
+MOST_CAUSES = 6
+
+
+@record
+class Cause:
+    """Something that the machine does in place of what was exported, and how much of the mismatch it explains."""
+
+    kind: str  # rate, late, sign, unit, factor, gain, limit, feedforward, compensation, gate, heat, another law, ...
+    what: str  # the signal, gain, term or file that it concerns
+    value: float | None  # factor, ticks, limit, rate
+    unit: str
+    removes: float  # share of the mismatch's energy
+    explains: bool  # leaves nothing but rounding
+
+
+@record(eq=False)
+class Alternative:
+    """A cause that may be, and what it makes of a setting."""
+
+    kind: str
+    what: str
+    change: Callable[[Setting], Setting]
+    value: float | None = None
+    unit: str = ""
+
+
+def find_causes(whole: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[tuple[Cause, ...], Setting]:
+    """Return the causes that explain a mismatch, the best first, and the setting as the first (and a second) has it."""
+    middle, size = int(np.argmax(np.abs(match.error))), max(WINDOW, count_head(whole.linear))
+    begin = max(0, min(middle - size // 2, len(whole.ticks) - size))
+    window = replace(whole, ticks=whole.ticks.take(slice(begin, begin + size)))
+    before = play(window).energy
+    if not before:
+        return (), whole
+    tried = sorted(_try_all(window, others), key=_rank)
+    if not tried or tried[0][1].energy >= before:
+        return (), whole
+    causes = [_make_cause(alternative, played, before) for alternative, played in tried[:MOST_CAUSES]]
+    best = tried[0][0]
+    if not causes[0].explains and causes[0].removes > MUCH:
+        behind = best.change(window)
+        second = min(_try_all(behind, {}), key=lambda pair: pair[1].energy, default=None)
+        if second is not None and second[1].met:
+            cause = _make_cause(second[0], second[1], before)
+            causes = [causes[0], cause, *causes[1:]]
+    return tuple(cause for cause in causes if cause.removes > 0.0), best.change(whole)
+
+
+def _rank(pair: tuple[Alternative, Match]) -> tuple[bool, bool, float]:
+    """Return the order of a cause: one that explains all first, and of those the ones without a fitted size."""
+    alternative, match = pair
+    return not match.met, match.met and alternative.kind in ("gain", "factor"), match.energy
+
+
+def _make_cause(alternative: Alternative, played: Match, before: float) -> Cause:
+    return Cause(
+        kind=alternative.kind,
+        what=alternative.what,
+        value=alternative.value,
+        unit=alternative.unit,
+        removes=1.0 - played.energy / before,
+        explains=played.met,
+    )
+
+
+def _try_all(setting: Setting, others: Mapping[str, Controller]) -> Iterator[tuple[Alternative, Match]]:
+    for alternative in list_alternatives(setting, others):
+        try:
+            played = play(alternative.change(setting))
+        except SeaoptError:  # a law that cannot run so
+            continue
+        if np.isfinite(played.energy):
+            yield alternative, played
+
+
+def list_alternatives(setting: Setting, others: Mapping[str, Controller]) -> Iterator[Alternative]:
+    """Yield what may be the cause, those that change the log first."""
+    yield from _list_of_time(setting)
+    yield from _list_factors(setting)
+    yield from _list_of_guards(setting)
+    yield from _list_of_gains(setting)
+    yield from _list_places(setting)
+    signals = setting.controller.signals
+    for name, other in others.items():
+        if other.signals == signals:
+            yield Alternative(kind="another law", what=name, change=lambda given, other=other: _take_law(given, other))
+
+
+def _take_law(setting: Setting, controller: Controller) -> Setting:
+    return replace(setting, controller=controller, law=runnable(controller))
+
+
+def _change_ticks(change: Callable[[Ticks], Ticks]) -> Callable[[Setting], Setting]:
+    return lambda setting: replace(setting, ticks=change(setting.ticks))
+
+
+def _list_of_time(setting: Setting) -> Iterator[Alternative]:
+    """Yield other rates, and signals that come late."""
+    for ticks in (1, -1, 2):
+        change = _change_ticks(lambda rows, late=ticks: rows.move_command(late))
+        yield Alternative(kind="late", what="command", change=change, value=ticks, unit="ticks")
+    for ticks in (1, 2):
+        change = _change_ticks(lambda rows, late=ticks: rows.delay_readings(late))
+        yield Alternative(kind="late", what="readings", change=change, value=ticks, unit="ticks")
+    same = float(np.mean(np.diff(setting.ticks.command) == 0.0))
+    for every in EVERY:
+        if same > 0.9 * (1.0 - 1.0 / every):
+            change = _change_ticks(lambda rows, every=every: rows.take_every(every))
+            rate = setting.ticks.rate_hz / every
+            yield Alternative(kind="rate", what="law", change=change, value=rate, unit="Hz")
+
+
+def _scale(what: str, factor: float, setting: Setting) -> Setting:
+    """Return a setting in which the law is given, or its command is, a factor times what it was."""
+    ticks, controller = setting.ticks, setting.controller
+    if what == "reference":
+        return replace(setting, ticks=replace(ticks, reference=factor * ticks.reference))
+    if what in controller.signals:
+        scale = np.ones(ticks.measured.shape[1])
+        scale[controller.signals.index(what)] = factor
+        return replace(setting, ticks=replace(ticks, measured=scale * ticks.measured))
+    return replace(setting, ticks=replace(ticks, command=ticks.command / factor))
+
+
+def _list_factors(setting: Setting) -> Iterator[Alternative]:
+    """Yield signs, units and other factors of reference, readings and command."""
+    fitted = _fit_factors(setting)
+    for what in ("reference", *setting.controller.signals, setting.controller.command.input):
+        factor = fitted.get(what)
+        usual = [-1.0, *UNITS] if factor is None else [factor]
+        for value in dict.fromkeys([-1.0, *usual]):
+            unit = next((each for each in UNITS if abs(value / each - 1.0) < SAME_FACTOR), None)
+            kind = "sign" if abs(value + 1.0) < SAME_FACTOR else "factor" if unit is None else "unit"
+            kind = "open loop" if abs(value) < SAME_FACTOR and what in setting.controller.signals else kind
+            value = -1.0 if kind == "sign" else value if unit is None else unit
+            yield Alternative(
+                kind=kind,
+                what=what,
+                value=value,
+                change=lambda given, what=what, value=value: _scale(what, value, given),
+            )
+
+
+def _fit_factors(setting: Setting) -> dict[str, float]:
+    """Return the factor of reference, of each reading, and of the command, that fits the logged commands best, each
+    by itself; none where the command is at its limit.
+    """
+    ticks, law = setting.ticks, setting.linear
+    limited = find_limited(ticks)
+    free = ~limited
+    if np.count_nonzero(free) < LEAST_HEAD:
+        return {}
+    nothing = replace(ticks, reference=0.0 * ticks.reference, measured=0.0 * ticks.measured)
+    parts = {"reference": follow(law, replace(nothing, reference=ticks.reference), limited, 0.0)}
+    for i, name in enumerate(setting.controller.signals):
+        measured = np.zeros_like(ticks.measured)
+        measured[:, i] = ticks.measured[:, i]
+        parts[name] = follow(law, replace(nothing, measured=measured), limited, 0.0)
+    together, modes = follow(law, ticks, limited), find_modes(law, limited)
+    columns = {**parts, setting.controller.command.input: together}
+    factors: dict[str, float] = {}
+    for name, column in columns.items():
+        target = ticks.command - (0.0 if column is together else together - column)
+        solved = np.linalg.lstsq(np.column_stack([column, modes])[free], target[free], rcond=1e-10)[0]
+        if np.isfinite(solved[0]) and (solved[0] or name in setting.controller.signals):
+            factors[name] = float(solved[0])
+    return factors
+
+
+def _change_law(*, linear: bool = False, **changes: Any) -> Callable[[Setting], Setting]:
+    """Return what changes a law, or its linear form, with the columns of the log that it then reads."""
+
+    def change(setting: Setting) -> Setting:
+        before = setting.linear if linear else setting.law
+        law = replace(before, **changes)
+        if isinstance(before, ForceMPC) or isinstance(law, ForceMPC):
+            return replace(setting, law=law)
+        read = [before.further.index(name) for name in law.further]
+        return replace(setting, law=law, ticks=replace(setting.ticks, further=setting.ticks.further[:, read]))
+
+    return change
+
+
+def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
+    """Yield limits, guards and terms that are others, or left out."""
+    law, linear, ticks = setting.law, setting.linear, setting.ticks
+    reached, unit = float(np.max(np.abs(ticks.command))), setting.controller.command.unit
+    if not math.isclose(reached, law.command_limit, rel_tol=1e-3):
+        change = lambda given: replace(given, law=limit_law(given.law, reached))  # noqa: E731
+        yield Alternative(kind="limit", what="command", value=reached, unit=unit, change=change)
+    if law.gate is not None:
+        yield Alternative(kind="gate", what="left out", change=_change_law(gate=None))
+    if law.heat is not None:
+        yield Alternative(kind="heat", what="left out", change=_change_law(heat=None))
+    if not isinstance(law, ForceMPC) and np.any(law.anti_windup):
+        none = np.zeros_like(law.anti_windup)
+        yield Alternative(kind="anti-windup", what="left out", change=_change_law(anti_windup=none))
+    added = linear.compensation
+    terms = [] if added is None else [name for name in ("friction", "gravity", "ripple") if getattr(added, name)]
+    for name in terms:
+        without = replace(added, **{name: None}) if added is not None and len(terms) > 1 else None
+        yield Alternative(kind="compensation", what=name, change=_change_law(linear=True, compensation=without))
+    if setting.controller.link is not None:
+        change = _change_ticks(
+            lambda rows: replace(rows, measured=rows.measured * _all_but_last(rows.measured.shape[1]))
+        )
+        yield Alternative(kind="feedforward", what="link", change=change)
+
+
+def _all_but_last(n: int) -> Float[np.ndarray, " n"]:
+    return np.append(np.ones(n - 1), 0.0)
+
+
+def _read_gains(controller: Controller) -> Gains | None:
+    """Return the gains that make a controller's law; None of a law of the user's own."""
+    if not set(LAW_GAINS) <= set(controller.gains):
+        return None
+    return Gains.from_names(controller.gains, controller.observer, controller.speed_loop, controller.link)
+
+
+def _list_places(setting: Setting) -> Iterator[Alternative]:
+    """Yield where a schedule's variable may have been for the law: at a point, or in another unit."""
+    law, place = setting.law, setting.ticks.place
+    if not isinstance(law, RunnableSchedule) or place is None:
+        return
+    points = law.table.points.tolist()
+    over = law.table.over
+    for point in dict.fromkeys([law.fallback, *points]):
+        change = _change_ticks(lambda rows, point=point: replace(rows, place=np.full(len(rows), point)))
+        yield Alternative(kind="place", what=over, value=point, unit=law.table.unit, change=change)
+    for factor in (-1.0, *UNITS):
+        change = _change_ticks(lambda rows, factor=factor: _scale_place(rows, factor))
+        kind = "sign" if factor < 0.0 else "unit"
+        yield Alternative(kind=kind, what=over, value=factor, change=change)
+
+
+def _scale_place(ticks: Ticks, factor: float) -> Ticks:
+    return replace(ticks, place=None if ticks.place is None else factor * ticks.place)
+
+
+def _make_law(controller: Controller, gains: Gains, sample_time_s: float | None = None) -> Callable[[Setting], Setting]:
+    """Return what gives a setting the law of other gains, or of another sample time, with the guards that it has."""
+
+    def change(setting: Setting) -> Setting:
+        period = sample_time_s or controller.sample_time_s
+        law = gains.law(controller.spec.structure, period).balanced()
+        made = runnable(replace(controller, law=law))
+        guards = {name: getattr(setting.linear, name) for name in ("gate", "heat", "compensation", "command_limit")}
+        return replace(setting, law=replace(made, **guards))
+
+    return change
+
+
+def _list_of_gains(setting: Setting) -> Iterator[Alternative]:
+    """Yield laws with parts that are left out, with gains of another size, and made for another rate."""
+    controller, gains = setting.controller, _read_gains(setting.controller)
+    if gains is None:
+        return
+    parts: list[tuple[str, str, dict[str, Any]]] = [
+        ("feedforward", "reference", {"k_r": gains.k_p}),
+        ("feedforward", "reference", {"k_r": 0.0}),
+        ("feedforward", "derivative of the reference", {"c": 0.0}),
+        ("feedforward", "derivative of the reference", {"c": 1.0}),
+        ("part", "prefilter", {"prefilter": None}),
+        ("part", "notch", {"notch": None}),
+        ("part", "disturbance observer", {"observer": None}),
+        ("part", "integral", {"k_i": 0.0}),
+        ("part", "derivative", {"k_d": 0.0}),
+        ("gain", "T_f", {"T_f": 0.5 * gains.T_f}),
+        ("gain", "T_f", {"T_f": 2.0 * gains.T_f}),
+    ]
+    for kind, what, changes in parts:
+        if any(getattr(gains, name) != value for name, value in changes.items()):
+            value = next(iter(changes.values())) if kind == "gain" else None
+            yield Alternative(
+                kind=kind, what=what, value=value, change=_make_law(controller, replace(gains, **changes))
+            )
+    for name, value in _fit_gains(setting, gains).items():
+        change = _make_law(controller, replace(gains, **{name: value}))
+        yield Alternative(kind="gain", what=name, value=value, change=change)
+    rates = {2.0 * controller.sample_time_s, 0.5 * controller.sample_time_s, 1.0 / setting.ticks.rate_hz}
+    for period in rates:
+        if not math.isclose(period, controller.sample_time_s, rel_tol=1e-3):
+            change = _make_law(controller, gains, period)
+            yield Alternative(kind="rate", what="gains", value=1.0 / period, unit="Hz", change=change)
+
+
+def _fit_gains(setting: Setting, gains: Gains) -> dict[str, float]:
+    """Return the size of each gain, alone, that fits the logged commands best: a law is linear in each of them."""
+    ticks, limited = setting.ticks, find_limited(setting.ticks)
+    free = ~limited
+    if np.count_nonzero(free) < LEAST_HEAD:
+        return {}
+    base, fitted = follow(setting.linear, ticks, limited), dict[str, float]()
+    modes = find_modes(setting.linear, limited)
+    for name in ("k_p", "k_i", "k_d", "k_r"):
+        value = getattr(gains, name)
+        if not value:
+            continue
+        changed = _make_law(setting.controller, replace(gains, **{name: 1.01 * value}))(setting)
+        column = (follow(changed.linear, ticks, limited) - base) / (0.01 * value)
+        table = np.column_stack([column, modes])
+        step = np.linalg.lstsq(table[free], (ticks.command - base)[free], rcond=1e-10)[0][0]
+        if np.isfinite(step) and value + step > 0.0:
+            fitted[name] = float(value + step)
+    return fitted
