@@ -23,7 +23,7 @@ from seaopt.machine.differences import Differences, compare
 from seaopt.machine.replay import Replay, replay
 from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
-from seaopt.machine.stepped import Source, stand
+from seaopt.machine.stepped import SAME_PLACE, Source, stand
 from seaopt.machine.ticks import Ticks, take_ticks
 from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
@@ -31,12 +31,12 @@ from seaopt.robustness import check_ranges
 from seaopt.units import unit_after
 
 DRAWS, SEED = 200, 1
-SAME_PLACE = 0.02  # of the span of a schedule's points: a variable that moves less stands still
 FEWER_TICKS = (
     "a machine with dry friction is compared with its model by simulation under the reference of every tick, which a "
     "log of every n-th has not"
 )
 OTHER_LAW = "the logs are not of this law; mend that first, then record again"
+UNTOLD_LAW = "the logs do not tell whether they are of this law"
 ACCEPTANCE_SCHEMA = "seaopt/acceptance/1"
 
 
@@ -146,7 +146,8 @@ def accept(
     Notes
     -----
     A log that has every n-th tick is compared line by line, which takes a periodic reference whose lines lie below half
-    of the log's rate, and whose period is a whole number of rows.
+    of the log's rate, and whose period is a whole number of rows. It is of this law where it excludes those with a gain
+    of half its size, with a reference, reading or command that is halved, or with a tick more delay; else undecided.
 
     A schedule is replayed as its variable moves; its response is judged where that stands still, against the figures
     that the law has there. Predictive control is replayed with its limits; its response is that of the law while none
@@ -194,7 +195,8 @@ def accept(
     sources = tuple(log.source for log in logs)
     result = Acceptance(controller=law, sources=sources, replays=replays, place=place)
     if not result.replayed:
-        return replace(result, left_out={"response": OTHER_LAW})
+        told = any(not row.met and not row.undecided for row in replays)
+        return replace(result, left_out={"response": OTHER_LAW if told else UNTOLD_LAW})
     rows = [
         ticks.move_command(row.command_late) if row.command_late and row.ticks_per_row == 1 else ticks
         for ticks, row in zip(rows, replays, strict=True)

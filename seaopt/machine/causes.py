@@ -8,7 +8,7 @@ where one removes much and leaves something, a second is looked for behind it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +29,9 @@ UNITS = tuple(each**power for each in (1e3, 60.0 / (2.0 * math.pi), 180.0 / math
 SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
 MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
 MOST_CAUSES = 6
+SHORT = {"gain": "short, gain", "factor": "short, factor", "late": "short, late"}  # more periods would tell these
+ROWS = ("terms", "moving", "periods", "saturated", "phases", "aliases")  # why a log of every n-th tick tells nothing
+UNDECIDED = ("rounding", *SHORT.values(), *ROWS)
 
 
 @record
@@ -41,6 +44,17 @@ class Cause:
     unit: str
     removes: float  # share of the mismatch's energy
     explains: bool  # leaves nothing but rounding
+
+    @property
+    def undecided(self) -> bool:
+        """Whether it lies in the log, which tells nothing therefore."""
+        return self.kind in UNDECIDED
+
+
+def leave_open(kind: str, what: str, value: float | None = None, unit: str = "") -> Cause:
+    """Return why a log tells nothing."""
+    assert kind in UNDECIDED
+    return Cause(kind=kind, what=what, value=value, unit=unit, removes=0.0, explains=False)
 
 
 @record(eq=False)
@@ -158,17 +172,24 @@ def _list_factors(setting: Setting) -> Iterator[Alternative]:
     for what in ("reference", *setting.controller.signals, setting.controller.command.input):
         factor = fitted.get(what)
         usual = [-1.0, *UNITS] if factor is None else [factor]
-        for value in dict.fromkeys([-1.0, *usual]):
-            unit = next((each for each in UNITS if abs(value / each - 1.0) < SAME_FACTOR), None)
-            kind = "sign" if abs(value + 1.0) < SAME_FACTOR else "factor" if unit is None else "unit"
-            kind = "open loop" if abs(value) < SAME_FACTOR and what in setting.controller.signals else kind
-            value = -1.0 if kind == "sign" else value if unit is None else unit
+        for each in dict.fromkeys([-1.0, *usual]):
+            kind, value = name_factor(what, each, setting.controller.signals)
             yield Alternative(
                 kind=kind,
                 what=what,
                 value=value,
                 change=lambda given, what=what, value=value: _scale(what, value, given),
             )
+
+
+def name_factor(what: str, value: float, signals: Sequence[str]) -> tuple[str, float]:
+    """Return what a factor of reference, reading or command is, and its value, exact where it is a sign or a unit."""
+    unit = next((each for each in UNITS if abs(value / each - 1.0) < SAME_FACTOR), None)
+    if abs(value + 1.0) < SAME_FACTOR:
+        return "sign", -1.0
+    if abs(value) < SAME_FACTOR and what in signals:
+        return "open loop", value
+    return ("factor", value) if unit is None else ("unit", unit)
 
 
 def _fit_factors(setting: Setting) -> dict[str, float]:
@@ -241,7 +262,7 @@ def _all_but_last(n: int) -> Float[np.ndarray, " n"]:
     return np.append(np.ones(n - 1), 0.0)
 
 
-def _read_gains(controller: Controller) -> Gains | None:
+def read_gains(controller: Controller) -> Gains | None:
     """Return the gains that make a controller's law; None of a law of the user's own."""
     if not set(LAW_GAINS) <= set(controller.gains):
         return None
@@ -283,9 +304,23 @@ def _make_law(controller: Controller, gains: Gains, sample_time_s: float | None 
 
 def _list_of_gains(setting: Setting) -> Iterator[Alternative]:
     """Yield laws with parts that are left out, with gains of another size, and made for another rate."""
-    controller, gains = setting.controller, _read_gains(setting.controller)
+    controller, gains = setting.controller, read_gains(setting.controller)
     if gains is None:
         return
+    for kind, what, value, part in list_parts(gains):
+        yield Alternative(kind=kind, what=what, value=value, change=_make_law(controller, part))
+    for name, value in _fit_gains(setting, gains).items():
+        change = _make_law(controller, replace(gains, **{name: value}))
+        yield Alternative(kind="gain", what=name, value=value, change=change)
+    rates = {2.0 * controller.sample_time_s, 0.5 * controller.sample_time_s, 1.0 / setting.ticks.rate_hz}
+    for period in rates:
+        if not math.isclose(period, controller.sample_time_s, rel_tol=1e-3):
+            change = _make_law(controller, gains, period)
+            yield Alternative(kind="rate", what="gains", value=1.0 / period, unit="Hz", change=change)
+
+
+def list_parts(gains: Gains) -> Iterator[tuple[str, str, float | None, Gains]]:
+    """Yield gains with parts that are left out or others: kind, name, value of a gain, and all of them."""
     parts: list[tuple[str, str, dict[str, Any]]] = [
         ("feedforward", "reference", {"k_r": gains.k_p}),
         ("feedforward", "reference", {"k_r": 0.0}),
@@ -302,17 +337,7 @@ def _list_of_gains(setting: Setting) -> Iterator[Alternative]:
     for kind, what, changes in parts:
         if any(getattr(gains, name) != value for name, value in changes.items()):
             value = next(iter(changes.values())) if kind == "gain" else None
-            yield Alternative(
-                kind=kind, what=what, value=value, change=_make_law(controller, replace(gains, **changes))
-            )
-    for name, value in _fit_gains(setting, gains).items():
-        change = _make_law(controller, replace(gains, **{name: value}))
-        yield Alternative(kind="gain", what=name, value=value, change=change)
-    rates = {2.0 * controller.sample_time_s, 0.5 * controller.sample_time_s, 1.0 / setting.ticks.rate_hz}
-    for period in rates:
-        if not math.isclose(period, controller.sample_time_s, rel_tol=1e-3):
-            change = _make_law(controller, gains, period)
-            yield Alternative(kind="rate", what="gains", value=1.0 / period, unit="Hz", change=change)
+            yield kind, what, value, replace(gains, **changes)
 
 
 def _fit_gains(setting: Setting, gains: Gains) -> dict[str, float]:

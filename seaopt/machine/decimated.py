@@ -1,63 +1,257 @@
 r"""The replay of a log that has every n-th tick only: line by line, since the law's state between the rows is unknown.
 
 The law is linear while nothing limits it, so that at each line of a periodic reference
-:math:`U = (C_r R - C_y Y)\,e^{-j\omega T l}`, with C at the law's own rate, T its sample time, and l the ticks by which
-the command is logged late. What readings and command share in noise drops out; what aliases into a line does not, and
-is in its disc, which is too wide to say something where the line is weak. Lines above half of the log's rate come back
+
+.. math:: U = (C_r R - C_y Y)\,e^{-j\omega T l} + G \gamma + e,
+
+with C at the law's own rate, T its sample time, and l the ticks by which the command is logged late. G holds what a
+state at the start of a period adds (:math:`c A^{nk}` over the rows k, and powers of k for what integrates); it is
+projected out. What is left, e, is what noise above half of the log's rate folds into a line: neighbouring lines have as
+much of it, and it is independent from period to period. Lines of the reference above half of the log's rate come back
 as others, where the law does not hold.
+
+With d what the command is off by at the lines, and :math:`\Phi` what another law's would be, both over the std of e and
+of a command that is as good as the same, :math:`a = \Phi^T d/\Phi^T\Phi` is the share of the other law, with the std
+:math:`1/|\Phi|`: 0 for the exported one, 1 for the other.
+
+- The law is *refuted* where :math:`|d|^2` is more than noise leaves, or a share is not zero.
+- It is *confirmed* where in each case another share than one is sure: of a gain of half its size, of a reference,
+  reading or command that is halved, of a tick's delay.
+- Else the log cannot tell. The std falls with the root of the periods, which says how many would do.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Complex, Float
 
-from seaopt.control import Controller
-from seaopt.machine.response.discs import Ratio
+from seaopt.control import Controller, RunnableSchedule
+from seaopt.control.laws.structures import Gains
+from seaopt.control.loops.law import Law
+from seaopt.errors import LogError
+from seaopt.logs.quality.faults import find_quantisation
+from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_parts, name_factor, read_gains
 from seaopt.machine.response.periods import Blocks, cut_periods
-from seaopt.machine.ticks import Ticks
+from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
+from seaopt.machine.stepped import SAME_PLACE, Setting
+from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
 MOST = 20  # ticks per row
 SAME_RATE = 0.02  # relative: of the log's clock and the law's, or a whole number of its ticks
-RISK = 0.01  # that a line of this law is taken for another's
+RISK = 1e-4  # that this law is taken for another's, or one that is excluded is the law
 OFF = 0.01  # of the command at a line, that is as good as nothing
-WIDEST, FEWEST_LINES = 0.3, 8  # radius of a disc that still says something; how many do
 LATE = (0, 1, -1)  # ticks
+NEIGHBOURS = 3  # lines on each side that have as much noise
+FITTED = 4.0  # of the misfit, that a size that is fitted has to take away more than a cause without
+MATTERS = 0.02  # of the law's response: what changes less of it at any frequency is the same law
+GRID = np.geomspace(1e-5, 0.45, 200)  # of the law's rate, where that is looked at
+SMALL = 1e-9  # of the largest singular value
+
+Parts = Complex[np.ndarray, "b m"]  # a row per period, or per set of phases, at the lines
+Lines = Complex[np.ndarray, " m"]  # their means over the reference
 
 
 @record(eq=False)
 class LineMatch:
-    """The command at the lines over what the law makes of reference and readings: 1, where it is this law."""
+    """How far the command is from the law's at the lines; nothing where they cannot be compared."""
 
-    f: Float[np.ndarray, " m"]
-    ratio: Complex[np.ndarray, " m"]
-    radius: Float[np.ndarray, " m"]
-    late: int  # ticks
-    size: float  # rms of the command at the lines
-
-    @property
-    def sure(self) -> Bool[np.ndarray, " m"]:
-        """Which lines say something."""
-        return self.radius < WIDEST
+    causes: tuple[Cause, ...]  # none where it is this law
+    off: Float[np.ndarray, " m"] | None = None  # of the command at each line, in its unit
+    allowed: float | None = None  # rms, in the command's unit
+    late: int = 0  # ticks
 
     @property
-    def off(self) -> Float[np.ndarray, " k"]:
-        """How far each of these is from the law's."""
-        return np.abs(self.ratio - 1.0)[self.sure]
+    def tells(self) -> bool:
+        """Whether it is this law, another whose name is sure, or too short a log to tell."""
+        first = self.causes[0] if self.causes else None
+        return first is None or first.explains or first.kind in SHORT.values()
+
+
+@record(eq=False)
+class Shift:
+    """What another law, or another log, would make of the commands at the lines."""
+
+    kind: str
+    what: str
+    commands: Parts  # of another less those of the law
+    unit: str = ""
+    value: float | None = None
+    base: float | None = None  # of what is scaled: its size, of which the shift is a half
+    asked: bool = False  # it has to be excluded
+
+    def name(self, share: float, signals: Sequence[str]) -> tuple[str, float | None]:
+        """Return its kind and value where a share of it is there."""
+        if self.base is None:
+            return self.kind, self.value
+        value = self.base * (1.0 - 0.5 * share)
+        return name_factor(self.what, value, signals) if self.kind == "factor" else (self.kind, value)
+
+
+@record(eq=False)
+class Off:
+    """What the command is off by at the lines, where it is taken to be logged so many ticks late."""
+
+    late: int
+    mean: Lines
+    std: Float[np.ndarray, " m"]  # of each of its parts
+    noise: Float[np.ndarray, " m"]  # of that, what falls with the root of the periods
+    free: int  # real numbers less what was projected out
+    known: float  # degrees of freedom of the std
+
+    def scale(self, mean: Lines) -> Float[np.ndarray, " k"]:
+        """Return real and imaginary parts over their std."""
+        return np.concatenate([np.real(mean) / self.std, np.imag(mean) / self.std])
 
     @property
-    def factor(self) -> float:
-        """What the command is times the law's, at the line in the middle of these."""
-        return float(np.median(np.real(self.ratio)[self.sure])) if np.any(self.sure) else 1.0
+    def misfit(self) -> float:
+        """Sum of squares of what is off."""
+        return float(np.sum(self.scale(self.mean) ** 2))
 
-    def is_near(self, factor: float) -> bool:
-        """Tell whether the command is a factor times the law's at every line, of which enough say something."""
-        allowed = self.radius + OFF * abs(factor)
-        enough = np.count_nonzero(self.sure) >= FEWEST_LINES
-        return bool(enough and np.all(np.abs(self.ratio - factor) <= allowed))
+    @property
+    def most(self) -> float:
+        """What a sum of squares is below, if nothing but noise is in it."""
+        from scipy.special import fdtri  # deferred: 0.1 s
+
+        return self.free * float(fdtri(self.free, self.known, 1.0 - RISK))
+
+    @property
+    def sigmas(self) -> float:
+        """How many std a share is within."""
+        from scipy.special import stdtrit  # deferred: 0.1 s
+
+        return float(stdtrit(self.known, 1.0 - 0.5 * RISK))
+
+    def fit(self, mean: Lines) -> tuple[float, float]:
+        """Return the share of a shift, and its std."""
+        vector = self.scale(mean)
+        size = float(vector @ vector)
+        return (float(vector @ self.scale(self.mean)) / size, size**-0.5) if size else (0.0, math.inf)
+
+
+@record(eq=False)
+class Table:
+    """The periods of a log, and what the law makes of them."""
+
+    controller: Controller
+    blocks: Blocks
+    ticks_per_row: int
+    made: Parts
+    leakage: Float[np.ndarray, "k n"]  # an orthonormal basis of what a state at the start of a period adds
+    rounding: Float[np.ndarray, " m"]  # std of each part of a command, of what the log is rounded to
+
+    @classmethod
+    def make(cls, controller: Controller, ticks: Ticks, blocks: Blocks, ticks_per_row: int) -> Table:
+        """Return the table of a log."""
+        responses = evaluate(controller.law, blocks, ticks_per_row)
+        steps = [find_quantisation(ticks.measured[:, i]) for i in range(ticks.measured.shape[1])]
+        steps = [ticks.quantum / abs(controller.command.per_effort), *steps]
+        gains = np.vstack([np.ones(blocks.f.size), np.abs(responses[1:])])
+        each = np.sqrt(np.sum((gains * np.array(steps)[:, None]) ** 2, axis=0) / (6.0 * blocks.rows))
+        return cls(
+            controller=controller,
+            blocks=blocks,
+            ticks_per_row=ticks_per_row,
+            made=make_commands(responses, blocks),
+            leakage=find_leakage(controller.law, blocks, ticks_per_row),
+            rounding=each,
+        )
+
+    def project(self, commands: Parts) -> Parts:
+        """Return commands without what a state at the start of a period adds."""
+        table = np.concatenate([np.real(commands), np.imag(commands)], axis=1)
+        table = table - table @ self.leakage @ self.leakage.T
+        return table[:, : commands.shape[1]] + 1j * table[:, commands.shape[1] :]
+
+    def average(self, commands: Parts) -> Lines:
+        """Return the mean of commands over the reference, without what a state adds."""
+        return np.mean(self.project(commands) / self.blocks.reference, axis=0)
+
+    def try_late(self, late: int) -> Off:
+        """Return what the command is off by; its std is that of its scatter over the periods, as much at neighbouring
+        lines.
+        """
+        blocks = self.blocks
+        off = self.project(shift_command(self.controller, blocks, late).effort - self.made)
+        (count, m), strength = off.shape, np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0))
+        normal = off / blocks.reference * strength
+        scatter = np.sum(np.abs(normal - np.mean(normal, axis=0)) ** 2, axis=0) / (2.0 * count * (count - 1))
+        free = 2 * m - self.leakage.shape[1]
+        share = free / (2.0 * m)  # of the noise, that was not projected out
+        window = np.ones(2 * NEIGHBOURS + 1)
+        near = np.convolve(scatter, window, "same")[:m] if m >= window.size else np.full(m, np.sum(scatter))
+        of = np.convolve(np.ones(m), window, "same")[:m] if m >= window.size else np.full(m, m)
+        noise = np.sqrt(near / of / share)
+        same = OFF * np.mean(np.abs(self.made), axis=0)
+        return Off(
+            late=late,
+            mean=np.mean(off / blocks.reference, axis=0),
+            std=np.sqrt(noise**2 + same**2 + self.rounding**2) / strength,
+            noise=noise / strength,
+            free=free,
+            known=2.0 * (count - 1) * float(np.min(of)) * share,
+        )
+
+    def list_late(self, taken: int) -> Iterator[Shift]:
+        """Yield commands that are logged otherwise late than is taken."""
+        ones = replace(self.blocks, effort=np.ones_like(self.made))
+        for late in LATE:
+            if late != taken:
+                commands = self.made * (shift_command(self.controller, ones, taken - late).effort - 1.0)
+                yield Shift(kind="late", what="command", commands=commands, value=late, unit="ticks", asked=True)
+
+    def list_shifts(self, others: Mapping[str, Controller]) -> Iterator[Shift]:
+        """Yield what may run in place of the law, or stand in its log."""
+        controller, blocks, made = self.controller, self.blocks, self.made
+        law, signals = controller.law, controller.signals
+        forward, *feedback = evaluate(law, blocks, self.ticks_per_row)
+        fed = forward * blocks.reference
+        parts = {"reference": fed, controller.command.input: made}
+        parts |= {name: feedback[i] * blocks.measured[:, i] for i, name in enumerate(signals)}
+        for name, part in parts.items():
+            yield Shift(kind="factor", what=name, commands=-0.5 * part, base=1.0, asked=bool(np.any(part)))
+        turned = np.exp(-2j * np.pi * blocks.f * controller.sample_time_s)
+        for late in (1, 2):
+            commands = (made - fed) * (turned**late - 1.0)
+            yield Shift(kind="late", what="readings", commands=commands, value=late, unit="ticks", asked=late == 1)
+        for name, other in others.items():
+            if other.signals == signals and math.isclose(other.sample_time_s, law.sample_time_s, rel_tol=1e-3):
+                yield Shift(kind="another law", what=name, commands=self.differ(other.law))
+        gains = read_gains(controller)
+        if gains is not None:
+            yield from self._list_gains(gains)
+
+    def _list_gains(self, gains: Gains) -> Iterator[Shift]:
+        structure, period, law = self.controller.spec.structure, self.controller.sample_time_s, self.controller.law
+        sizes = gains.by_name()
+        for name, half in _halve(gains):
+            changed = half.law(structure, period).balanced()
+            asked = _matters(law, changed)
+            yield Shift(kind="gain", what=name, commands=self.differ(changed), base=sizes[name], asked=asked)
+        for kind, what, value, part in list_parts(gains):
+            yield Shift(kind=kind, what=what, commands=self.differ(part.law(structure, period)), value=value)
+        for factor in (0.5, 2.0):
+            commands, rate = self.differ(gains.law(structure, factor * period)), 1.0 / (factor * period)
+            yield Shift(kind="rate", what="gains", commands=commands, value=rate, unit="Hz")
+
+    def differ(self, law: Law) -> Parts:
+        """Return what another law makes more than this one."""
+        return make_commands(evaluate(law, self.blocks, self.ticks_per_row), self.blocks) - self.made
+
+    def is_alias(self, found: Off) -> bool:
+        """Tell whether the law holds at what comes back as the lines, above half of the log's rate."""
+        reach = self.ticks_per_row // 2
+        responses = [
+            evaluate(self.controller.law, self.blocks, self.ticks_per_row, k) for k in range(-reach, reach + 1)
+        ]
+        off = np.array([self.blocks.effort - make_commands(each, self.blocks) for each in responses])
+        nearest = np.argmin(np.mean(np.abs(off), axis=1), axis=0)
+        chosen = np.take_along_axis(off, nearest[None, None, :], axis=0)[0]
+        return float(np.sum(found.scale(self.average(chosen)) ** 2)) <= found.most
 
 
 def count_ticks_per_row(controller: Controller, ticks: Ticks) -> int:
@@ -67,24 +261,138 @@ def count_ticks_per_row(controller: Controller, ticks: Ticks) -> int:
     return whole if 2 <= whole <= MOST and abs(ratio / whole - 1.0) <= SAME_RATE else 1
 
 
-def match_lines(controller: Controller, ticks: Ticks) -> LineMatch:
-    """Return how the law matches a log line by line, with the lateness that suits best. Raises LogError: the reference
-    does not repeat, or too few periods are whole.
-    """
-    blocks = cut_periods(controller, ticks)
-    forward, *feedback = controller.law.responses(blocks.f)
-    made = forward * blocks.reference + np.sum(np.array(feedback) * blocks.measured, axis=1)
-    tried: list[LineMatch] = []
-    for late in LATE:
-        seen = shift_command(controller, blocks, late)
-        ratio = Ratio(numerator=seen.effort, denominator=made)
-        centre, radius = ratio.disc(RISK / blocks.f.size)
-        size = float(np.sqrt(0.5 * np.mean(np.sum(np.abs(seen.effort) ** 2, axis=1)))) * controller.command.per_effort
-        tried.append(LineMatch(f=blocks.f, ratio=centre, radius=radius, late=late, size=size))
-    return min(tried, key=lambda match: float(np.sum(np.abs((match.ratio - match.factor) / match.radius) ** 2)))
+def match_lines(setting: Setting, ticks_per_row: int, others: Mapping[str, Controller]) -> LineMatch:
+    """Return how a law matches a log line by line, or why that cannot be told."""
+    controller, ticks, law = setting.controller, setting.ticks, setting.law
+    if setting.linear.compensation is not None:
+        return LineMatch(causes=(leave_open("terms", "law"),))
+    if isinstance(law, RunnableSchedule):
+        moved = 0.0 if ticks.place is None else float(np.ptp(ticks.place))
+        if moved > SAME_PLACE * np.ptp(law.table.points):
+            return LineMatch(causes=(leave_open("moving", law.table.over),))
+    try:
+        blocks = cut_periods(controller, ticks)
+    except LogError:
+        limited = find_saturated(ticks, setting.linear.command_limit) > 0.5
+        return LineMatch(
+            causes=(leave_open("saturated", "command") if limited else leave_open("periods", "reference"),)
+        )
+    dry, phases = has_dry_friction(controller), blocks.realisations
+    if dry and phases >= LEAST_PHASES:
+        blocks = blocks.average()
+    table = Table.make(controller, ticks, blocks, ticks_per_row)
+    tried = [table.try_late(late) for late in LATE]
+    found, shifts = min(tried, key=lambda each: each.misfit), [*table.list_shifts(others)]
+    asked = [*shifts, *table.list_late(found.late)]
+    vectors = [table.average(shift.commands) for shift in asked]
+    if is_off(found, asked, vectors):
+        named = [name_causes(each, shifts, vectors, controller.signals) for each in tried]
+        at = min(range(len(tried)), key=lambda k: named[k][0])
+        found, causes = tried[at], named[at][1]
+        if not causes or not causes[0].explains:
+            if dry and phases < LEAST_PHASES:
+                causes = (leave_open("phases", "log"),)
+            elif table.is_alias(found):
+                causes = (leave_open("aliases", "reference"),)
+    else:
+        causes = list_untold(found, asked, vectors, blocks.period_s * len(blocks.reference))
+    size = np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0)) * abs(controller.command.per_effort)
+    allowed = float(np.sqrt(np.sum((found.std * size) ** 2)))
+    return LineMatch(causes=causes, off=np.abs(found.mean) * size, allowed=allowed, late=found.late)
+
+
+def evaluate(law: Law, blocks: Blocks, ticks_per_row: int, image: int = 0) -> Complex[np.ndarray, "k m"]:
+    """Return a law's responses at the lines, or at what comes back as them, by the log's own clock."""
+    turns = (np.round(blocks.f * blocks.period_s) / blocks.rows + image) / ticks_per_row
+    return law.evaluate(np.expm1(2j * np.pi * turns))
+
+
+def make_commands(responses: Complex[np.ndarray, "k m"], blocks: Blocks) -> Parts:
+    """Return what a law of these responses makes of reference and readings."""
+    return responses[0] * blocks.reference + np.sum(responses[1:] * blocks.measured, axis=1)
+
+
+def find_leakage(law: Law, blocks: Blocks, ticks_per_row: int) -> Float[np.ndarray, "k n"]:
+    """Return an orthonormal basis, at the lines, of what a law's state at the start of a period adds to its rows."""
+    rows, lines = blocks.rows, np.round(blocks.f * blocks.period_s).astype(int)
+    a, _, row = law.rest
+    stepped, columns = np.linalg.matrix_power(a, ticks_per_row), np.empty((rows, row.size))
+    for k in range(rows):
+        columns[k] = row
+        row = row @ stepped
+    powers = np.linspace(0.0, 1.0, rows, endpoint=False)[:, None] ** np.arange(1, law.integrators + 1)
+    spectrum = np.fft.rfft(np.hstack([columns, powers]), axis=0)[lines]
+    table = np.concatenate([spectrum.real, spectrum.imag])
+    table /= np.maximum(np.linalg.norm(table, axis=0), np.finfo(float).tiny)
+    left, size, _ = np.linalg.svd(table, full_matrices=False)
+    return left[:, size > SMALL * np.max(size, initial=0.0)]
 
 
 def shift_command(controller: Controller, blocks: Blocks, late: int) -> Blocks:
     """Return blocks with the command so many ticks of the law earlier."""
     turned = np.exp(2j * np.pi * blocks.f * controller.sample_time_s * late)
     return replace(blocks, effort=blocks.effort * turned)
+
+
+def is_off(found: Off, shifts: Sequence[Shift], means: Sequence[Lines]) -> bool:
+    """Tell whether the command is off by more than noise: as a whole, or towards what has to be excluded."""
+    towards = [found.fit(mean) for shift, mean in zip(shifts, means, strict=True) if shift.asked]
+    return found.misfit > found.most or any(abs(share) > found.sigmas * std for share, std in towards)
+
+
+def list_untold(found: Off, shifts: Sequence[Shift], means: Sequence[Lines], seconds: float) -> tuple[Cause, ...]:
+    """Return what the log does not exclude beside the law, with the seconds of it that would, the longest first; none
+    where no length would. `seconds`: of the log's periods.
+    """
+    untold: list[Cause] = []
+    for shift, mean in zip(shifts, means, strict=True):
+        share, std = found.fit(mean)
+        if not shift.asked or abs(share) + found.sigmas * std < 1.0:
+            continue
+        needed = math.inf
+        if math.isfinite(std):
+            vector = found.scale(mean)
+            part = float(np.sum((vector * np.tile(found.noise / found.std, 2)) ** 2)) * std**2  # that periods lessen
+            least = (0.5 / found.sigmas) ** 2 - std**2 * (1.0 - part)
+            needed = max(std**2 * part / least, 1.0) if least > 0.0 else math.inf
+        value = seconds * needed if math.isfinite(needed) else None
+        untold.append(leave_open(SHORT[shift.kind], shift.what, value, "s"))
+    return tuple(sorted(untold, key=lambda cause: -(cause.value or math.inf)))
+
+
+Rank = tuple[bool, float]
+
+
+def name_causes(
+    found: Off, shifts: Sequence[Shift], means: Sequence[Lines], signals: Sequence[str]
+) -> tuple[Rank, tuple[Cause, ...]]:
+    """Return what would explain that the command is off, the best first, and how good that is."""
+    target, before = found.scale(found.mean), found.misfit
+    rated: list[tuple[Rank, Cause]] = []
+    for shift, mean in zip(shifts, means, strict=False):
+        share = 1.0 if shift.base is None else found.fit(mean)[0]
+        after = float(np.sum((target - share * found.scale(mean)) ** 2))
+        kind, value = shift.name(share, signals)
+        removes, explains = 1.0 - after / before, after <= found.most
+        cause = Cause(kind=kind, what=shift.what, value=value, unit=shift.unit, removes=removes, explains=explains)
+        if removes > 0.0 and (shift.kind != "gain" or (value or 0.0) > 0.0):
+            rated.append(((not explains, after + FITTED * (kind in ("gain", "factor"))), cause))
+    rated.sort(key=lambda pair: pair[0])
+    rank = rated[0][0] if rated else (True, before)
+    return rank, tuple(cause for _, cause in rated[:MOST_CAUSES])
+
+
+def _halve(gains: Gains) -> Iterator[tuple[str, Gains]]:
+    """Yield the gains in which a law is linear, each at half its size."""
+    for name in ("k_p", "k_i", "k_d", "k_r"):
+        value = getattr(gains, name)
+        if value:
+            yield name, replace(gains, **{name: 0.5 * value})
+    if gains.inner is not None:
+        yield "k_v", replace(gains, inner=replace(gains.inner, k_v=0.5 * gains.inner.k_v))
+
+
+def _matters(law: Law, other: Law) -> bool:
+    """Tell whether another law differs somewhere by more than is as good as nothing."""
+    first, second = (each.evaluate(np.expm1(2j * np.pi * GRID)) for each in (law, other))
+    return bool(np.any(np.abs(second - first) > MATTERS * np.abs(first)))

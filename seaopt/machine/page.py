@@ -33,8 +33,45 @@ MISSED = (
 )
 
 
+EVERY_TICK = "of a log with every n-th tick"
+OPEN = {
+    "terms": "terms of the law (friction, gravity, ripple) are not linear; log every tick",
+    "moving": "the schedule's variable moves; hold it at a value, or log every tick",
+    "periods": "its reference has to repeat, a whole number of rows each time, three times at least and with the "
+    "command below its limit; play such a one, or log every tick",
+    "saturated": "the command is at its limit in most rows, where all laws look alike; check signs and units, and "
+    "lower the amplitude",
+    "phases": "dry friction folds into its lines; play six sets of random phases, or log every tick",
+    "aliases": "lines of the reference above half of the log's rate come back as others; play slower ones, or log "
+    "every tick",
+}
+UNTOLD = {
+    "short, gain": "a law whose {} is half as large",
+    "short, factor": "a {} that is halved",
+    "short, late": "a {} of one tick later",
+}
+
+
+def _say_open(cause: Cause) -> str:
+    """Return why a log does not tell which law it is of, and what would."""
+    if cause.kind in OPEN:
+        return f"undecided, {EVERY_TICK}: {OPEN[cause.kind]}"
+    if cause.kind == "rounding":
+        value = format_number(cause.value)
+        return f"undecided: rounding of the log allows {value} (rms) of the command; log it with more digits"
+    other = UNTOLD[cause.kind].format("reading" if cause.what == "readings" else cause.what)
+    more = (
+        "no length of this reference would decide: play lines where that acts, or log every tick"
+        if cause.value is None
+        else f"{format_number(cause.value, 2)} s of this reference would decide"
+    )
+    return f"undecided: the log cannot tell this law from {other}; {more}"
+
+
 def say_cause(cause: Cause) -> str:
     """Return what a cause means for who wrote the firmware."""
+    if cause.undecided:
+        return _say_open(cause)
     value = format_number(cause.value)
     match cause.kind:
         case "rate" if cause.what == "clock":
@@ -65,8 +102,6 @@ def say_cause(cause: Cause) -> str:
             return f"the compensation of {cause.what} is missing"
         case "part":
             return f"the {cause.what} is missing"
-        case "rounding":
-            return f"undecided: rounding of the log allows {value} (rms) of the command; log it with more digits"
         case "another law":
             return f"it is the law of {cause.what}"
         case _:
@@ -150,6 +185,8 @@ def _say_mismatch(row: Replay, result: Acceptance) -> str:
     if row.undecided or (row.causes and row.causes[0].explains):
         return say_cause(row.causes[0])
     off = f"the command is off by {format_number(row.mismatch, 3)}{unit} (rms), of {format_number(row.rms, 3)}{unit}"
+    if row.ticks_per_row > 1:
+        off = f"{off}, or lines of the reference lie above half of the log's rate"
     if not row.causes:
         return f"{off}; {MISSED}"
     return f"{off}; nearest: {say_cause(row.causes[0])} ({100.0 * row.causes[0].removes:.0f} % of it)"
@@ -281,7 +318,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
 
 def summarise(result: Acceptance) -> list[KeyFigure]:
     """Return how near the replay comes."""
-    worst = max(result.replays, key=lambda row: row.mismatch)
+    worst = max(result.replays, key=lambda row: row.mismatch or 0.0)
     unit = unit_after(result.controller.command.unit)
     off, size = (f"{format_number(value, 3)}{unit}" for value in (worst.mismatch, worst.rms))
     figures = [KeyFigure(name="command off (rms)", value=off, against=f"of {size}")]

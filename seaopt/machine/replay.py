@@ -11,16 +11,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from seaopt.control import Controller
-from seaopt.errors import LogError
-from seaopt.machine.causes import SAME_FACTOR, Cause, find_causes
-from seaopt.machine.decimated import SAME_RATE, count_ticks_per_row, match_lines
+from seaopt.machine.causes import Cause, find_causes, leave_open
+from seaopt.machine.decimated import SAME_RATE, LineMatch, count_ticks_per_row, match_lines
 from seaopt.machine.stepped import Setting, Source, make_setting, play
-from seaopt.machine.ticks import AT_LIMIT, Ticks
+from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
 SIGMAS = 4.0  # of what rounding allows
 COARSEST = 0.1  # of the command's rms, that rounding may allow of a replay that decides
-UNDECIDED = ("rounding",)  # causes that lie in the log, for which it decides nothing
 
 
 @record
@@ -29,9 +27,9 @@ class Replay:
 
     met: bool
     ticks: int
-    mismatch: float  # rms, in the command's unit
-    largest: float
-    allowed: float  # rms that rounding allows
+    mismatch: float | None  # rms, in the command's unit; None where nothing could be compared
+    largest: float | None
+    allowed: float | None  # rms that rounding, or noise between the rows, allows
     rms: float  # of the command about its mean
     off_from: int | None  # first tick that is off
     saturated: float  # share of the ticks at the limit
@@ -44,7 +42,7 @@ class Replay:
     @property
     def undecided(self) -> bool:
         """Whether the log cannot tell this law from another."""
-        return bool(self.causes) and self.causes[0].kind in UNDECIDED
+        return bool(self.causes) and self.causes[0].undecided
 
 
 def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None = None) -> Replay:
@@ -54,13 +52,16 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
     whole = make_setting(source, ticks)
     match = play(whole)
     ticks_per_row = 1 if match.met else count_ticks_per_row(whole.controller, ticks)
-    by_line = _replay_lines(whole, ticks_per_row) if ticks_per_row > 1 else None
-    if by_line is not None:
-        return by_line
+    lines = match_lines(whole, ticks_per_row, others or {}) if ticks_per_row > 1 else None
+    if lines is not None and lines.tells:
+        return _describe_lines(whole, lines, ticks_per_row)
     late, causes = 0, ()
     if not match.met:
         causes, changed = find_causes(whole, match, others or {})
         first = causes[0] if causes else None
+        limited = find_saturated(ticks, whole.linear.command_limit) > 0.5  # where all laws are alike
+        if lines is not None and (limited or first is None or not first.explains):
+            return _describe_lines(whole, lines, ticks_per_row)
         if first is not None and first.kind == "late" and first.what == "command" and first.explains:
             late, causes, match = int(first.value or 0), (), play(changed)
     rate_hz, law_rate_hz = ticks.rate_hz, 1.0 / whole.controller.sample_time_s
@@ -68,9 +69,8 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
         causes = (Cause(kind="rate", what="clock", value=rate_hz, unit="Hz", removes=1.0, explains=True),)
     allowed, rms = math.sqrt(float(np.mean(match.allowed**2))), float(np.std(ticks.command))
     if match.met and not causes and allowed > COARSEST * rms:
-        causes = (Cause(kind="rounding", what="log", value=allowed, unit="", removes=0.0, explains=False),)
+        causes = (leave_open("rounding", "log", allowed),)
     met = match.met and not causes
-    limit = whole.linear.command_limit
     off = np.flatnonzero(np.abs(match.error) > SIGMAS * match.allowed)
     return Replay(
         met=met,
@@ -80,7 +80,7 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
         allowed=allowed,
         rms=rms,
         off_from=None if match.met or not off.size else int(off[0]),
-        saturated=find_saturated(ticks, limit),
+        saturated=find_saturated(ticks, whole.linear.command_limit),
         command_late=late,
         rate_hz=rate_hz,
         law_rate_hz=law_rate_hz,
@@ -88,40 +88,21 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
     )
 
 
-def _replay_lines(setting: Setting, ticks_per_row: int) -> Replay | None:
-    """Return the replay of a log with every n-th tick, where its lines are those of the law, or of a factor times it;
-    None where they are not, or the law has terms, which are not linear.
-    """
-    controller, ticks = setting.controller, setting.ticks
-    if setting.linear.compensation is not None:
-        return None
-    try:
-        match = match_lines(controller, ticks)
-    except LogError:
-        return None
-    factor = match.factor
-    if not match.is_near(1.0) and not match.is_near(factor):
-        return None
-    met, name, limit = match.is_near(1.0), controller.command.input, setting.linear.command_limit
-    kind = "sign" if abs(factor + 1.0) < SAME_FACTOR else "factor"
-    cause = Cause(kind=kind, what=name, value=factor, unit="", removes=1.0, explains=True)
+def _describe_lines(setting: Setting, match: LineMatch, ticks_per_row: int) -> Replay:
+    """Return the replay of a log with every n-th tick, line by line."""
+    ticks, off = setting.ticks, match.off
     return Replay(
-        met=met,
+        met=not match.causes,
         ticks=len(ticks),
-        mismatch=match.size * float(np.sqrt(np.mean(match.off**2))),
-        largest=match.size * float(np.max(match.off)),
-        allowed=match.size * float(np.sqrt(np.mean(match.radius[match.sure] ** 2))),
+        mismatch=None if off is None else float(np.sqrt(0.5 * np.sum(off**2))),
+        largest=None if off is None else float(np.max(off)),
+        allowed=match.allowed,
         rms=float(np.std(ticks.command)),
         off_from=None,
-        saturated=find_saturated(ticks, limit),
+        saturated=find_saturated(ticks, setting.linear.command_limit),
         command_late=match.late,
         rate_hz=ticks.rate_hz,
-        law_rate_hz=1.0 / controller.sample_time_s,
+        law_rate_hz=1.0 / setting.controller.sample_time_s,
         ticks_per_row=ticks_per_row,
-        causes=() if met else (cause,),
+        causes=match.causes,
     )
-
-
-def find_saturated(ticks: Ticks, limit: float) -> float:
-    """Return the share of the ticks at the limit."""
-    return float(np.mean(np.abs(ticks.command) >= AT_LIMIT * limit)) if math.isfinite(limit) else 0.0

@@ -43,6 +43,7 @@ from seaopt.records import record
 from seaopt.robustness import linear_controller
 
 SETTLED = 400  # rows over which the estimate of predictive control follows the log
+SAME_PLACE = 0.02  # of the span of a schedule's points: a variable that moves less stands still
 FLOOR = 1e-3  # of the command's variation: a mismatch below is none
 ROUNDING = 2.0  # times the std that rounding leaves by the estimate: a mismatch up to there is rounding
 HEAD = 400  # rows that tell the state at the first

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -133,3 +134,8 @@ def _find_longest(log: Log, whole: Any) -> slice:
             if stop - start > best.stop - best.start:
                 best = slice(segment.start + int(start), segment.start + int(stop))
     return best
+
+
+def find_saturated(ticks: Ticks, limit: float) -> float:
+    """Return the share of the ticks at the limit."""
+    return float(np.mean(np.abs(ticks.command) >= AT_LIMIT * limit)) if math.isfinite(limit) else 0.0

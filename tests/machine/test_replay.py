@@ -166,22 +166,85 @@ def test_a_law_with_gravity_compensation_is_replayed_from_the_middle_of_a_run_an
 GENTLE = multisine(1000, LINES, 8, 60.0, 3, bias=300.0)
 
 
+def keep_every(log, every, *, late=0, factor=1.0, rows=slice(2, -2)):
+    """Return every n-th row of a log, with the command some rows late, and scaled."""
+    columns = {name: log[name][rows][::every] for name in ("reference", "F1")} | {"time": log.time[rows][::every]}
+    return so.Log.from_arrays(**columns, I=factor * np.roll(log["I"], late)[rows][::every])
+
+
 @pytest.mark.parametrize("late", [0, 1, -1])
 def test_a_log_of_every_second_tick_is_compared_at_its_lines(controller, bench, late):
     log = bench.log(Machine(), GENTLE)
-    rows = slice(2, GENTLE.size - 2, 2)
-    columns = {name: log[name][rows] for name in ("reference", "F1")} | {"time": log.time[rows]}
-    columns["I"] = np.roll(log["I"], late)[rows]
-    result = so.accept(controller, [so.Log.from_arrays(**columns)])
+    result = so.accept(controller, [keep_every(log, 2, late=late)])
     (row,) = result.replays
     assert row.met and (row.ticks_per_row, row.command_late) == (2, late), result
     assert result.differences.inside and "refuted" not in {each.outcome for each in result.response.judged}
-    columns["I"] = 0.5 * columns["I"]
-    cause = cause_of(controller, so.Log.from_arrays(**columns))
+    cause = cause_of(controller, keep_every(log, 2, late=late, factor=0.5))
     assert (cause.kind, cause.what) == ("factor", "I") and np.isclose(cause.value, 0.5, rtol=0.01)
 
 
-def test_a_log_of_every_second_tick_of_another_law_is_refused(controller, bench):
-    log = bench.log(replace(Machine(), reading_sign=-1.0), GENTLE).between(0.0, 9.9)
-    columns = {name: log[name][::2] for name in ("reference", "F1", "I")}
-    assert not so.accept(controller, [so.Log.from_arrays(time=log.time[::2], **columns)]).replayed
+SLOW = np.unique(np.round(np.geomspace(1, 45, 20)).astype(int))
+
+
+@pytest.fixture(scope="module")
+def halved(compiler, tmp_path_factory, controller):
+    """Return the benches of the law with each gain at half its size."""
+    from seaopt.control import Gains
+
+    gains, folder = Gains.from_names(controller.gains), tmp_path_factory.mktemp("halved")
+    benches = {}
+    for name in ("k_p", "k_i", "k_d"):
+        law = replace(gains, **{name: 0.5 * controller.gains[name]}).law("pid", 1e-3).balanced()
+        custom = replace(controller, law=law, structure="custom", gains={}, spec=replace(SPEC, structure="custom"))
+        benches[name] = Bench(compiler, folder, custom, name)
+    return benches
+
+
+@pytest.mark.parametrize("every", [2, 10])
+@pytest.mark.parametrize("periods", [4, 12])
+def test_few_rows_of_a_right_law_are_never_another_and_a_halved_gain_is_never_this_law(
+    controller, bench, halved, every, periods
+):
+    for seed in range(3):
+        reference = multisine(1000, SLOW, periods, 60.0, seed, bias=300.0)
+        right = so.accept(controller, [keep_every(bench.log(Machine(), reference, seed=seed), every)])
+        (row,) = right.replays
+        assert row.met or row.undecided, row
+        if row.undecided:
+            assert row.causes[0].value > 0.001 * reference.size and "would decide" in str(right), right
+        for name, each in halved.items():
+            (row,) = so.accept(controller, [keep_every(each.log(Machine(), reference, seed=seed), every)]).replays
+            assert not row.met
+            cause = row.causes[0]
+            assert row.undecided or (cause.kind, cause.what) == ("gain", name), (seed, name, row)
+            assert row.undecided or np.isclose(cause.value, 0.5 * controller.gains[name], rtol=0.2)
+
+
+def test_the_seconds_that_would_decide_do(controller, bench):
+    short = keep_every(bench.log(Machine(), multisine(1000, SLOW, 4, 20.0, 1, bias=300.0)), 10)
+    (row,) = so.accept(controller, [short]).replays
+    assert row.undecided and row.causes[0].kind.startswith("short")
+    periods = int(row.causes[0].value) + 2
+    longer = keep_every(bench.log(Machine(), multisine(1000, SLOW, periods, 20.0, 1, bias=300.0)), 10)
+    assert periods < 300 and so.accept(controller, [longer]).replayed
+
+
+@pytest.mark.parametrize(
+    ("reference", "kind"),
+    [
+        (multisine(1000, np.arange(3, 96, 4), 8, 60.0, 3), "aliases"),
+        (multisine(1000, SLOW, 8, 1500.0, 3), "saturated"),
+        (300.0 + 60.0 * np.cumsum(np.random.default_rng(1).normal(size=4000)) / 60.0, "periods"),
+    ],
+)
+def test_where_lines_of_a_right_law_cannot_be_compared_nothing_is_made_up(controller, bench, reference, kind):
+    result = so.accept(controller, [keep_every(bench.log(Machine(), reference), 10)])
+    (row,) = result.replays
+    assert row.undecided and row.causes[0].kind == kind and repr(result), row
+    assert "do not tell" in result.left_out["response"]
+
+
+def test_a_log_of_every_second_tick_of_a_loop_that_ran_away_is_no_proof_of_anything(controller, bench):
+    log = bench.log(replace(Machine(), reading_sign=-1.0), GENTLE)
+    (row,) = so.accept(controller, [keep_every(log, 2)]).replays
+    assert row.undecided and row.causes[0].kind == "saturated"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -30,6 +31,7 @@ class Blocks:
     effort: Complex[np.ndarray, "b m"]  # the command over what an effort of one takes
     measured: Complex[np.ndarray, "b y m"]
     realisation: Int[np.ndarray, " b"]  # which stretch of the reference, of one set of phases
+    rows: int  # of a period
     period_s: float
     amplitude: float  # rms of the reference about its mean
     saturated: int  # periods that were left out since the command was at its limit
@@ -47,16 +49,7 @@ class Blocks:
             np.array([part[chosen].mean(axis=0) for chosen in rows])
             for part in (self.reference, self.effort, self.measured)
         )
-        return Blocks(
-            f=self.f,
-            reference=reference,
-            effort=effort,
-            measured=measured,
-            realisation=kinds,
-            period_s=self.period_s,
-            amplitude=self.amplitude,
-            saturated=self.saturated,
-        )
+        return replace(self, reference=reference, effort=effort, measured=measured, realisation=kinds)
 
 
 def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
@@ -148,6 +141,7 @@ def _transform(
         effort=scale * command[:, lines] / controller.command.per_effort,
         measured=scale * measured[:, :, lines],
         realisation=np.array([number for _, number in starts]),
+        rows=period,
         period_s=period / ticks.rate_hz,
         amplitude=float(np.sqrt(0.5 * np.mean(np.sum(np.abs(scale * reference[:, lines]) ** 2, axis=1)))),
         saturated=saturated,
@@ -173,13 +167,12 @@ def _join(group: Sequence[Blocks]) -> Blocks:
     if len(group) == 1:
         return group[0]
     offsets = np.cumsum([0, *(int(np.max(part.realisation)) + 1 for part in group[:-1])])
-    return Blocks(
-        f=group[0].f,
+    return replace(
+        group[0],
         reference=np.concatenate([part.reference for part in group]),
         effort=np.concatenate([part.effort for part in group]),
         measured=np.concatenate([part.measured for part in group]),
         realisation=np.concatenate([part.realisation + at for part, at in zip(group, offsets, strict=True)]),
-        period_s=group[0].period_s,
         amplitude=float(np.mean([part.amplitude for part in group])),
         saturated=sum(part.saturated for part in group),
     )
