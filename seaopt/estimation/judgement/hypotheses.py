@@ -67,6 +67,8 @@ class Hypothesis:
     usual: Callable[[float], float] | None = None
     built_in: Callable[[Plant], str | None] = lambda plant: None
     lag: Callable[[Mapping[str, float]], float] = lambda start: 0.0  # s, that a fitted delay has in place of the effect
+    # that a fitted stiffness has in place of it
+    stiffens: Callable[[Sizes, Mapping[str, float]], float] = lambda sizes, start: 0.0
 
 
 def _zero(*names: str) -> Callable[[Sizes], Starts]:
@@ -79,9 +81,9 @@ def _rise_at_rest(s: Sizes) -> Starts:
 
 
 def _slip_in_spring(s: Sizes) -> Starts:
-    """Return a spring that gives way at a tenth of the deflection, gradually and nearly at once."""
-    start = {"k_h": 0.05 * s.stiffness, "y_h": 0.1 * s.deflection}
-    return [{**start, "n_h": sharpness} for sharpness in (1.0, 4.0)] if s.deflection else []
+    """Return a spring that gives way at a tenth of the deflection, gradually and nearly at once, or hardly at all."""
+    shares = ((0.05, 0.1, 1.0), (0.05, 0.1, 4.0), (0.1, 0.8, 10.0)) if s.deflection else ()
+    return [{"k_h": part * s.stiffness, "y_h": share * s.deflection, "n_h": n} for part, share, n in shares]
 
 
 # In the order in which they are tried, those that are the quickest to refit first.
@@ -132,6 +134,7 @@ HYPOTHESES = (
         part="hysteresis",
         starts=_slip_in_spring,
         searched=("n_h",),
+        stiffens=lambda s, start: start["k_h"] * start["y_h"] / s.deflection,
     ),
     Hypothesis(
         effect="the joint gives way before it slips",
@@ -171,6 +174,7 @@ class Change:
     starts: Starts  # of what the last of them frees
     frees: tuple[str, ...]  # of all of them
     fixed: Mapping[str, float]
+    sizes: Sizes
 
     @property
     def effect(self) -> str:
@@ -223,6 +227,7 @@ def change_plants(
         experiments=tuple(replace(each, plant=changed[each.plant]) for each in experiments),
         params=params.with_parameters(*added),
         starts=starts,
+        sizes=sizes,
     )
 
 

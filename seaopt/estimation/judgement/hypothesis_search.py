@@ -199,7 +199,7 @@ class _Search:
                 continue
             self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
             try:
-                refit = _refit(change, problem, fitted, self.helps, self.base, self.end, self.first)
+                refit = _refit(change, problem, fitted, self.helps, self.base, self.end)
             except SeaoptError:  # what does not make a problem explains nothing
                 continue
             if refit is not None:
@@ -212,18 +212,18 @@ def _take_values(refit: Refit) -> ParameterSet:
 
 
 def _refit(
-    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, end: int, first: float
+    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, end: int
 ) -> Refit | None:
     """Return the minimum with a change, from the fit's, `base` the fit without any; None where it cannot be simulated.
 
     A search that takes less than `helps` of the residual's power in a round of iterations is given up, and so is one
-    that has come to `end`, a count of evaluations. `first`: the fit's excess.
+    that has come to `end`, a count of evaluations.
     """
     before = count_evaluations()
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
     for name in ("sigma", "substeps"):
         problem = problem.with_values(name, {e.name: getattr(e, name) for e in old.experiments})
-    start = _choose_start(change, problem, old.unknowns.by_name(fitted.z), near=first <= ASKS)
+    start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
     if not np.isfinite(start.cost):
         return None
     problem = _rest(problem, start, old)
@@ -235,11 +235,11 @@ def _refit(
         if np.any(powers < HALF * checked):
             problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS, roughly=True)
             checked = powers
-        low, high, begun = unknowns.low, unknowns.high, evaluation
-        near = NEAR if np.any(powers < HALF * at_fit) else max(NEAR, SLIGHT * helps * begun.cost)
-        solution = minimise(problem, begun, low, high, decrement=near, max_iterations=ROUND, first_radius=radius)
+        low, high, first = unknowns.low, unknowns.high, evaluation
+        near = NEAR if np.any(powers < HALF * at_fit) else max(NEAR, SLIGHT * helps * first.cost)
+        solution = minimise(problem, first, low, high, decrement=near, max_iterations=ROUND, first_radius=radius)
         evaluation = solution.evaluation
-        if evaluation is begun and solution.status == "max_iterations" and radius == FIRST_RADIUS:
+        if evaluation is first and solution.status == "max_iterations" and radius == FIRST_RADIUS:
             radius = CLOSE  # every step went too far
             continue
         if not np.isfinite(evaluation.cost):
@@ -277,21 +277,24 @@ def _settle(refit: Refit, start: Evaluation) -> Refit:
     return replace(refit, evaluation=evaluation, excess=excess, gain=gain)
 
 
-def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float], *, near: bool) -> Evaluation:
-    """Return the evaluation at the fit's values and the best start of what is added: near noise that from which a step
-    of all else is to gain the most, for what a fit has in place of an effect is at odds with most of it.
+def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float]) -> Evaluation:
+    """Return the evaluation at the fit's values and the best start of what is added: that from which a step of all else
+    is to gain the most, for what a fit has in place of an effect is at odds with most of it.
     """
     unknowns, evaluations = problem.unknowns, list[Evaluation]()
     delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
+    hypothesis, springs = change.hypotheses[-1], {e.plant.spring for e in change.experiments}
+    stiffnesses = [unknowns.names.index(s.stiffness) for s in springs if s and s.stiffness in unknowns.names]
     for start in change.starts:
         z = unknowns.start_from({**fitted, **start})
-        z[delays] -= change.hypotheses[-1].lag(start)
+        z[delays] -= hypothesis.lag(start)
+        z[stiffnesses] -= hypothesis.stiffens(change.sizes, start)
         evaluations.append(problem.evaluate(np.clip(z, unknowns.low, unknowns.high)))
     others = np.array([name in fitted for name in unknowns.names])
 
     def reach(evaluation: Evaluation) -> float:
-        if not near or not np.isfinite(evaluation.cost):
-            return evaluation.cost
+        if not np.isfinite(evaluation.cost):
+            return np.inf
         free = others & ~find_blocked(evaluation, unknowns.low, unknowns.high)
         return evaluation.cost - 0.5 * evaluation.distance_squared(free)
 

@@ -120,6 +120,11 @@ def test_a_spring_in_which_something_slips_is_named():
     assert result.hypotheses[0].fixed["n_h"] > 3.0
 
 
+def test_a_spring_that_hardly_slips_is_as_stiff_as_without_what_slips():
+    """Up to most of its deflection both springs are stiff together: the fit's stiffness is that of both."""
+    check(fit(record(slip=(30.0, 0.1))), "hysteresis", k_h=30.0, y_h=0.1)
+
+
 @pytest.mark.slow
 def test_a_joint_that_gives_way_before_it_slips_is_named():
     check(fit(record(bristle=0.1)), "lugre", sigma_0=0.1)
