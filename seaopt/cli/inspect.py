@@ -18,12 +18,13 @@ from seaopt.logs.formats import open_source
 from seaopt.logs.log.alignment import Rule
 from seaopt.logs.reading.clock_samples import guess_time_unit, runs_on
 from seaopt.logs.reading.selection import ClockError, is_time_name
+from seaopt.logs.reading.vocabulary import find_unit_in_name, read_header
 from seaopt.progress import divide
 from seaopt.reporting.sections import describe
 from seaopt.reporting.sections.data import Section
 from seaopt.reporting.sections.text import Most, render_sections
 from seaopt.signals import Table
-from seaopt.units import is_unit, same_dimension
+from seaopt.units import is_unit, same_dimension, si_unit
 
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
 MAX_DIGITS = 9  # of a count
@@ -72,7 +73,7 @@ def inspect_log(
     with show_progress(console, "inspecting the log", console.say, brief=True) as tell:
         reading, looking, drawing = divide(tell, 1.0, 1.0, float(folder is not None))  # for a long log
         reading("reading", 0.0)
-        table = _read_on_clock(path, read, time, unit_of.get("time"))
+        table = _take_units_of_names(_read_on_clock(path, read, time, unit_of.get("time")))
         quality = assess_quality(table, inputs=list(inputs) or None, progress=looking)
         if folder is not None:
             from seaopt.reporting import write_quality_figure
@@ -115,12 +116,22 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
         return replace(table, notes=(note, *table.notes))
 
 
+def _take_units_of_names(table: Table) -> Table:
+    """Return the table with the units that the names of channels without one end in, and a note of them."""
+    units = {name: find_unit_in_name(name) for name, signal in table.signals.items() if not signal.unit}
+    signals, taken = dict(table.signals), {name: unit for name, unit in units.items() if unit is not None}
+    for name, unit in taken.items():
+        values = Column(column=name).to_si(signals[name].values.copy(), unit, table.source)
+        signals[name] = replace(signals[name], values=values, unit=si_unit(unit))
+    listed = ", ".join(f"{unit} of {name}" for name, unit in taken.items())
+    notes = (f"units were taken from names: {listed}",) if taken else ()
+    return replace(table, signals=signals, notes=(*table.notes, *notes))
+
+
 def _choose_clock(path: Path, candidates: Sequence[str]) -> tuple[str, str] | None:
     """Return the likely clock and its unit: the column whose header states a unit of time, or that runs on, or else is
     named like a time; None where there is none.
     """
-    from seaopt.problem.proposal.vocabulary import read_header  # deferred: the problem file's classes take time
-
     stated = {field.name: field.unit for field in contents(path).fields}
     units = {name: read_header(name, stated.get(name)).unit for name in candidates}
     for name, unit in units.items():

@@ -14,12 +14,12 @@ from seaopt.control.scheduling.gain_table import check_points
 from seaopt.control.scheduling.scheduled_controller import find_unit
 from seaopt.errors import ControlError, ProblemError, SeaoptError, UnitError, suggestion
 from seaopt.formatting import join_words
+from seaopt.logs.reading.vocabulary import read_header
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.motor.thermal import PARAMETERS as HEAT
 from seaopt.problem.bench_tables import ExperimentTable, SensorsTable
 from seaopt.problem.columns import check_inside
-from seaopt.problem.proposal.vocabulary import read_header
 from seaopt.problem.schema import ControllerTable, ExpectTable, ProblemTable, RangeTable
 from seaopt.robustness import check_ranges, place_value
 from seaopt.robustness.uncertainty.draws import find_modes

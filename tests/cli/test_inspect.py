@@ -14,6 +14,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.cli.inspect import inspect_log
 from seaopt.errors import SeaoptError
+from tests.actuator_logs import write_csv
 
 
 @pytest.fixture(scope="module")
@@ -222,3 +223,28 @@ def test_of_a_file_without_a_clock_the_rate_is_asked_for(tmp_path):
     path.write_text("a,b\n" + "".join(f"{at % 7},{at % 3}\n" for at in range(40)), encoding="utf-8")
     with pytest.raises(SeaoptError, match=r"type seaopt inspect \S+ --rate-hz 1000"):
         inspect_log(path)
+
+
+def test_units_at_the_end_of_names_are_taken_and_no_output_is_proposed_as_an_input(tmp_path):
+    time = np.arange(4000) / 1000
+    current = np.random.default_rng(1).normal(size=time.size)
+    angle = np.where((time > 2.0) & (time < 2.2), 20.0, 20.0 + 5.0 * np.sin(8.0 * time))
+    columns = {"time_s": time, "i_cmd_A": current, "motor_angle_deg": angle, "pos_m": angle}
+    write_csv(tmp_path / "log.csv", columns)
+    inspect_log(tmp_path / "log.csv", folder=tmp_path)
+    quality = json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))
+    units = {name: channel["unit"] for name, channel in quality["channels"].items()}
+    assert units == {"i_cmd_A": "A", "motor_angle_deg": "rad", "pos_m": ""}
+    assert quality["inputs"] == ["i_cmd_A"]
+    assert quality["channels"]["motor_angle_deg"]["high"] == pytest.approx(np.deg2rad(angle.max()))
+    assert any("deg of motor_angle_deg" in note for note in quality["notes"])
+    stuck = [each["sentence"] for each in quality["findings"] if each["kind"] == "stuck"]
+    assert stuck and not any("--input" in sentence for sentence in stuck)
+
+
+def test_a_column_named_with_its_unit_needs_no_other(tmp_path):
+    write_csv(tmp_path / "log.csv", {"time_ms": np.arange(50.0), "i_mA": np.arange(50.0), "theta_m": np.arange(50.0)})
+    log = so.read_log(tmp_path / "log.csv", time="time_ms", channels={"I": "i_mA"})
+    assert log.signals["I"].unit == "A" and log["I"][-1] == pytest.approx(0.049) and log.period == pytest.approx(1e-3)
+    with pytest.raises(SeaoptError, match=r"theta_m.* has no unit"):
+        so.read_log(tmp_path / "log.csv", time="time_ms", channels={"q": "theta_m"})

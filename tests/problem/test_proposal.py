@@ -10,12 +10,12 @@ import pytest
 
 import seaopt as so
 from seaopt.logs.quality.spectra import compute_spectra
+from seaopt.logs.reading.vocabulary import is_m_open, read_header, split_words
 from seaopt.problem import json_schema
 from seaopt.problem.proposal import propose
 from seaopt.problem.proposal.questions import name_entry
 from seaopt.problem.proposal.survey import regress, slow_sign, survey_log
 from seaopt.problem.proposal.traits import fit_delay
-from seaopt.problem.proposal.vocabulary import is_m_open, read_header, split_words
 from tests.actuator_logs import KNEE, SCREW, drive, knee, screw, write_csv
 
 RATE = 400.0

@@ -111,8 +111,10 @@ def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Ite
         )
 
 
-def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
-    """Yield what is wrong with one channel."""
+def find_channel_faults(
+    channel: ChannelQuality, time: Float[np.ndarray, " n"], *, may_drive: bool
+) -> Iterator[Finding]:
+    """Yield what is wrong with one channel; `may_drive`: it may be an input, as far as is known."""
     name, unit, missing, beyond = channel.name, channel.unit, channel.missing, channel.beyond
     fault = partial(_locate, time=time, channel=name)
     if missing.samples == time.size:
@@ -144,13 +146,14 @@ def find_channel_faults(channel: ChannelQuality, time: Float[np.ndarray, " n"]) 
         return
     if len(channel.stuck):
         longest = int(np.max(channel.stuck.lengths))
-        typed = f"--input {shlex.quote(name)} (inputs=[{json.dumps(name, ensure_ascii=False)}])"
         text = (
             f"{name} stands still {format_count(len(channel.stuck), 'time')}, up to {longest} samples, where it "
             "otherwise changes: a sensor or a message that stopped, or a joint that stuck. If the joint stuck there, "
-            "leave those samples, for a fit of friction needs them; else cut the log there, or set them to NaN. An "
-            f"input that holds its value is named: {typed}"
+            "leave those samples, for a fit of friction needs them; else cut the log there, or set them to NaN"
         )
+        if may_drive:
+            typed = f"--input {shlex.quote(name)} (inputs=[{json.dumps(name, ensure_ascii=False)}])"
+            text += f". An input that holds its value is named: {typed}"
         yield fault(channel.stuck, kind="stuck", severity="warning", unit=unit, sentence=text)
     for rail in channel.rails:
         edge = "largest" if rail.side == "high" else "least"

@@ -186,7 +186,9 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     pairs = () if spectra is None else _correlate_pairs(spectra, inputs, channels)
     excitation = {} if spectra is None else _assess_inputs(spectra, inputs)
     findings = [*find_clock_faults(clock, data.time)]
-    findings += [finding for channel in channels.values() for finding in find_channel_faults(channel, data.time)]
+    for channel in channels.values():
+        may_drive = not inputs and channel.unit in ("", *INPUT_UNITS)
+        findings += find_channel_faults(channel, data.time, may_drive=may_drive)
     findings += [finding for pair in pairs for finding in find_pair_faults(pair, clock.period, pair.first in inputs)]
     findings += [describe_excitation(bands) for bands in excitation.values()]
     findings += _list_unjudged(inputs, spectra, [rows.stop - rows.start for rows in segments], clock)

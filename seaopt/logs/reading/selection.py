@@ -17,6 +17,7 @@ from seaopt.logs.log.alignment import Rule
 from seaopt.logs.reading.clock_samples import guess_time_unit
 from seaopt.logs.reading.column import Column, spell_column
 from seaopt.logs.reading.counter import Counter
+from seaopt.logs.reading.vocabulary import find_unit_in_name
 from seaopt.records import record
 from seaopt.signals import check_distinct
 from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
@@ -70,9 +71,15 @@ class FileColumn:
     field: Field
 
     @property
+    def stated_unit(self) -> str | None:
+        """Its unit, before it is checked; None where nothing says it."""
+        stated = (self.column.unit, self.field.unit)
+        return next((unit for unit in stated if unit is not None), find_unit_in_name(self.field.name))
+
+    @property
     def unit(self) -> str:
-        """Its unit: as given, else as the file says."""
-        unit = self.column.unit if self.column.unit is not None else self.field.unit
+        """Its unit: as given, else as the file says, else as its name ends in."""
+        unit = self.stated_unit
         where = f'{self.source.path}: column "{self.field.name}"'
         if unit is None:
             named = f'write it in the header\'s brackets, "{self.field.name} [unit]", or '
@@ -254,7 +261,7 @@ def _list_paths(sources: Sequence[Source]) -> str:
 
 def _make_clock(file_column: FileColumn) -> ClockColumn:
     column, source, name = file_column.column, file_column.source, file_column.field.name
-    if column.unit is None and file_column.field.unit is None:
+    if file_column.stated_unit is None:
         unit = guess_time_unit(source.read([name])[name]) if file_column.field.numeric else "s"
         raise ClockError(
             f'{source.path}: column "{name}" has no unit, and is the time; give it, {unit} by the size of its steps: '

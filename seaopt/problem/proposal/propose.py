@@ -26,6 +26,7 @@ from seaopt.errors import LogError, ProblemError
 from seaopt.files import check_name
 from seaopt.formatting import format_count, join_words
 from seaopt.logs.quality.clock import assess_clock
+from seaopt.logs.reading.vocabulary import COUNTS, UNITS_OF, is_m_open, read_header
 from seaopt.problem.proposal.actuators import Facts, propose_linear, propose_rotary
 from seaopt.problem.proposal.described_log import GEARED, DescribedLog, doubt_clock, make_table
 from seaopt.problem.proposal.problem_text import write_problem_text
@@ -48,7 +49,6 @@ from seaopt.problem.proposal.stated import Stated
 from seaopt.problem.proposal.survey import ENOUGH as FEW
 from seaopt.problem.proposal.survey import LogSurvey, SurveyedColumn, regress, slow_sign, survey_log
 from seaopt.problem.proposal.traits import OUTLIERS, find_traits
-from seaopt.problem.proposal.vocabulary import COUNTS, UNITS_OF, is_m_open, read_header
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 from seaopt.units import factor, same_dimension

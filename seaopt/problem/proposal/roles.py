@@ -8,8 +8,8 @@ import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.formatting import join_words
+from seaopt.logs.reading.vocabulary import UNITS_OF, Quantity
 from seaopt.problem.proposal.survey import LogSurvey, SurveyedColumn, find_leader, regress, share_of_jerk
-from seaopt.problem.proposal.vocabulary import UNITS_OF, Quantity
 from seaopt.records import record
 from seaopt.units import header_unit
 

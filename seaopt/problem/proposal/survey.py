@@ -19,7 +19,7 @@ from seaopt.logs.log.resampling import fill_holes
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.logs.quality.findings import MOST_BRIDGED
 from seaopt.logs.reading.clock_samples import guess_time_unit, runs_on
-from seaopt.problem.proposal.vocabulary import Header, is_count, is_named_time, read_header
+from seaopt.logs.reading.vocabulary import Header, is_count, is_named_time, read_header
 from seaopt.records import record
 from seaopt.units import factor, is_unit
 

@@ -145,6 +145,12 @@ def is_m_open(header: Header) -> bool:
     return header.unit == "m" and read_header(header.name, metres=False).quantity == "angle"
 
 
+def find_unit_in_name(name: str) -> str | None:
+    """Return the unit that a name ends in, as i_cmd_A or time_s; None where it ends in none, or in what may be none."""
+    header = read_header(name)
+    return header.unit if header.unit and is_unit(header.unit) and not is_m_open(header) else None
+
+
 def is_count(unit: str) -> bool:
     """Tell whether a header's unit is the steps of an encoder or a converter."""
     return unit.strip().lower().rstrip(".") in COUNT_UNITS
