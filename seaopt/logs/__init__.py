@@ -1,6 +1,6 @@
 """Read raw files as `Log`, and find their faults."""
 
-from seaopt.logs.log.alignment import Hold, Linear, Nearest
+from seaopt.logs.log.alignment import Hold, Linear, Nearest, Readings
 from seaopt.logs.log.concatenation import concatenate
 from seaopt.logs.log.log import Log
 from seaopt.logs.quality.findings import Finding
@@ -13,6 +13,6 @@ from seaopt.signals import Table
 from seaopt.units import header_unit
 
 __all__ = [
-    "Column", "Contents", "Counter", "Finding", "Hold", "Linear", "Log", "Nearest", "Quality", "Table",
+    "Column", "Contents", "Counter", "Finding", "Hold", "Linear", "Log", "Nearest", "Quality", "Readings", "Table",
     "assess_quality", "concatenate", "contents", "header_unit", "read_log", "read_table", "write_log",
 ]  # fmt: skip

@@ -163,17 +163,22 @@ class NearestTable(StrictTable):
     tolerance_s: Number = key("Farthest sample that counts.", gt=0)
 
 
+class ReadingsTable(StrictTable):
+    """Each sample once, at the instant nearest to it; elsewhere there is none."""
+
+
 class AlignTable(StrictTable):
     """How a channel of another clock comes to the log's: exactly one of these."""
 
     hold: HoldTable | None = key("The last sample at or before each instant.", default=None)
     linear: LinearTable | None = key("Interpolation between neighbours.", default=None)
     nearest: NearestTable | None = key("The nearest sample.", default=None)
+    readings: ReadingsTable | None = key("Each sample once: outputs of a slower or a shifted clock.", default=None)
 
     @model_validator(mode="after")
     def _one(self) -> AlignTable:
-        if sum(rule is not None for rule in (self.hold, self.linear, self.nearest)) != 1:
-            raise ValueError("give exactly one of hold, linear and nearest")
+        if sum(rule is not None for rule in (self.hold, self.linear, self.nearest, self.readings)) != 1:
+            raise ValueError("give exactly one of hold, linear, nearest and readings")
         return self
 
 

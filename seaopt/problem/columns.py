@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from seaopt.errors import ProblemError
-from seaopt.logs import Column, Hold, Linear, Nearest
+from seaopt.logs import Column, Hold, Linear, Nearest, Readings
 from seaopt.logs.log.alignment import Rule
 from seaopt.problem.bench_tables import AlignTable, ClockTable, ColumnTable, ExperimentTable
 
@@ -57,6 +57,11 @@ def make_rule(table: AlignTable | None) -> Rule | None:
     """Return an alignment rule."""
     if table is None:
         return None
-    kinds: dict[str, Callable[..., Rule]] = {"hold": Hold, "linear": Linear, "nearest": Nearest}
+    kinds: dict[str, Callable[..., Rule]] = {
+        "hold": Hold,
+        "linear": Linear,
+        "nearest": Nearest,
+        "readings": Readings,
+    }
     (name,) = (name for name in kinds if getattr(table, name) is not None)
     return kinds[name](**getattr(table, name).model_dump(exclude_none=True))

@@ -29,7 +29,7 @@ from seaopt.estimation import (
 )
 from seaopt.formatting import format_remedies
 from seaopt.frequency import MeasuredResponse, measure_response
-from seaopt.logs import Counter, Log, read_log
+from seaopt.logs import Counter, Log, Readings, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Difference, Plant
 from seaopt.problem.bench_tables import (
@@ -443,10 +443,9 @@ def _resample(log: Log, table: ExperimentTable) -> Log:
         return log.restamp()
     if resample.rule == "restamp":
         return log.restamp(rate_hz=resample.rate_hz)
-    rule, steps = make_rule(resample.rule), list(table.inputs) if table.hold == "zero" else []
-    return log.resample(
-        rate_hz=resample.rate_hz, rule=rule, steps=steps if rule is None else (), bridge_s=resample.bridge_s
-    )
+    rule = make_rule(resample.rule)
+    steps = list(table.inputs) if table.hold == "zero" and isinstance(rule, Readings | None) else []
+    return log.resample(rate_hz=resample.rate_hz, rule=rule, steps=steps, bridge_s=resample.bridge_s)
 
 
 def _make_method(table: FitTable) -> Method:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from seaopt.errors import LogError
-from seaopt.logs import Column, Counter, Hold, Linear, Nearest, read_table
+from seaopt.logs import Column, Counter, Hold, Linear, Nearest, Readings, read_table
 from seaopt.logs.quality.faults import find_counter_losses
 
 FAST = np.arange(40) / 100
@@ -26,7 +26,7 @@ def channels(**options):
 
 
 def test_another_clock_needs_a_rule(files):
-    with pytest.raises(LogError, match=r"cell.csv.*on the clock.*Hold\(\), Linear\(\) or Nearest"):
+    with pytest.raises(LogError, match=r"cell.csv.*on the clock.*Hold\(\), Linear\(\), Nearest"):
         read_table(files, time="t [s]", channels=channels())
 
 
@@ -36,6 +36,15 @@ def test_linear_is_numpys_between_samples_and_missing_outside(files):
     expected = np.where(inside, np.interp(FAST, SLOW, np.cos(9 * SLOW)), np.nan)
     np.testing.assert_allclose(table.signals["F"].values, expected, atol=1e-8)
     assert f"{np.sum(~inside)} of 40 samples lie outside" in " ".join(table.notes)
+
+
+def test_a_reading_counts_once_where_a_cubic_takes_it(files):
+    values = read_table(files, time="t [s]", channels=channels(align=Readings())).signals["F"].values
+    read = np.isfinite(values)
+    assert np.count_nonzero(read) == 6  # of 8: the first would be taken ahead of all, the last is past the log
+    np.testing.assert_allclose(values[read], np.cos(9 * FAST[read]), atol=5e-4)
+    cubic = Readings()(FAST, SLOW, SLOW**3 - SLOW)
+    np.testing.assert_allclose(cubic[read], FAST[read] ** 3 - FAST[read], atol=1e-12)
 
 
 def test_hold_never_looks_ahead(files):

@@ -62,7 +62,11 @@ def test_a_window_and_a_rule_for_all(problem):
         ('"motor.csv"\n', '"../motor.csv"\n', "leaves the problem file's folder"),
         ('"cell.csv"', '"/tmp/cell.csv"', "leaves the problem file's folder"),
         ('"cell.csv"', '"C:\\\\cell.csv"', "leaves the problem file's folder"),
-        ("linear = { max_gap_s = 0.01 }", "linear = {}, hold = {}", "exactly one of hold, linear and nearest"),
+        (
+            "linear = { max_gap_s = 0.01 }",
+            "linear = {}, hold = {}",
+            "exactly one of hold, linear, nearest and readings",
+        ),
         ("wrap_bits = 16", "wrap_bits = 99", "wrap_bits"),
         ("wrap_bits = 16", 'from = "footer"', "header"),
         ("clock_offset_s = -0.5", "clok_offset_s = -0.5", 'did you mean "clock_offset_s"'),

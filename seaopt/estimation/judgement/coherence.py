@@ -24,6 +24,7 @@ from jaxtyping import Bool, Complex, Float
 from seaopt import welch
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
+from seaopt.estimation.result.model_error import bridge
 from seaopt.records import record
 
 STRETCHES = (16, 64)  # how many half-overlapping pairs of them the samples make
@@ -75,7 +76,7 @@ def _gather(
     experiment: FitExperiment, residuals: ExperimentResiduals
 ) -> tuple[list[Float[np.ndarray, "n m"]], list[Float[np.ndarray, "n ny2"]]]:
     """Return the inputs that move and [measured, residual] of each output, of each segment's samples that count. A
-    sample that does not count is replaced by the model's.
+    sample that does not count is replaced by the model's, and a missing one by those beside it.
     """
     moving: list[Float[np.ndarray, "n m"]] = []
     signals: list[Float[np.ndarray, "n ny2"]] = []
@@ -87,9 +88,10 @@ def _gather(
             u = np.concatenate([np.repeat(u[:1], min(delay, len(u)), axis=0), u[: max(len(u) - delay, 0)]])
         used = segment.mark_counted(0)
         last = max((row.size - int(np.argmax(row[::-1])) for row in used.T if row.any()), default=0)
-        error = np.where(used & np.isfinite(left.raw), -left.raw, 0.0)
+        error = np.where(used | np.isnan(left.raw), -left.raw, 0.0)
         measured = np.stack(samples.y, axis=1)
         measured = np.where(used, measured, measured + left.raw)
+        error, measured = (np.stack([bridge(column) for column in rows.T], axis=1) for rows in (error, measured))
         if last > 1 and np.all(np.isfinite(measured[:last])):
             moving.append(u[:last])
             signals.append(np.concatenate([measured.T, _tame(error, used).T])[:, :last].T)  # cut by signal later

@@ -75,9 +75,8 @@ def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> 
         rms[o] = np.sqrt(power / max(count[o], 1.0))
         apart = max(map(_count_between, output.measured), default=1)
         # What is held out may be far off, which is no noise.
-        raw = [np.where(mask, part, np.nan) for mask, part in zip(used, residuals.raw_of(name), strict=True)]
+        raw = [part[mask] for mask, part in zip(used, residuals.raw_of(name), strict=True)]
         seconds = [_take_second(loss.slope(part * (gain / sigma)), apart) for part in raw]
-        seconds = [part[np.isfinite(part)] for part in seconds]
         neighbours = float(np.sqrt(np.mean(np.concatenate(seconds) ** 2) / 6.0)) if any(map(len, seconds)) else 0.0
         quantum = find_quantisation(np.concatenate(output.measured)) / sigma
         step[o] = 0.0 if settle or experiment.predictor is not None else quantum

@@ -294,7 +294,7 @@ def _split(
     """Return which of the samples that count, of each segment, are late in the log, large, and fast."""
     effort, fast = [], []
     for segment, left in zip(experiment.segments, residuals.segments, strict=True):
-        model = np.stack(segment.samples.y, axis=1) + left.raw
+        model = np.stack([bridge(values) for values in (np.stack(segment.samples.y, axis=1) + left.raw).T], axis=1)
         effort.append(_measure_envelope(model[:, find_effort(experiment.data)], experiment.period))
         fast.append(_measure_speed(experiment, model))
     used = np.concatenate(counted)
@@ -306,6 +306,12 @@ def _split(
         masks.append(mask & np.array([late, envelope > middles[0], speed > middles[1]]))
         first += int(np.count_nonzero(mask))
     return masks
+
+
+def bridge(values: Signal) -> Signal:
+    """Return a signal with its missing samples on lines between those that are there."""
+    there = np.flatnonzero(np.isfinite(values))
+    return values if there.size in (0, values.size) else np.interp(np.arange(values.size), there, values[there])
 
 
 def find_effort(experiment: Experiment) -> int:

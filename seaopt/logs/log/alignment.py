@@ -119,7 +119,49 @@ class Nearest:
         return np.where(inside & (np.abs(time[best] - at) <= self.tolerance_s), values[best], np.nan)
 
 
-Rule = Hold | Linear | Nearest
+@record
+class Readings:
+    """Each sample once, at the instant nearest to it, to which the cubic through four samples takes it; elsewhere there
+    is none: outputs of a slower or a shifted clock, of which lines between samples would make more than was measured.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> time = np.array([0.2, 2.2, 4.2, 6.0])
+    >>> Readings()(np.arange(7.0), time, time**3).round(9).tolist()
+    [nan, nan, 8.0, nan, 64.0, nan, 216.0]
+    """
+
+    @property
+    def reach_s(self) -> float:
+        """How far from an instant the rule looks for samples."""
+        return np.inf
+
+    def __call__(
+        self, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"]
+    ) -> Float[np.ndarray, " n"]:
+        """Return the values at the instants `at`, NaN where the rule has none."""
+        out, read = np.full(at.size, np.nan), np.isfinite(values)
+        time, values = time[read], values[read]
+        points = min(4, time.size)
+        if at.size < 2 or not points:
+            return out
+        after = np.clip(np.searchsorted(at, time), 1, at.size - 1)
+        row = np.where(time - at[after - 1] < at[after] - time, after - 1, after)
+        near = np.abs(at[row] - time) <= 0.5 * float(np.median(np.diff(at))) + TICK
+        row = np.unique(row[near & (at[row] >= time[0] - TICK) & (at[row] <= time[-1] + TICK)])
+        first = np.clip(np.searchsorted(time, at[row]) - points // 2, 0, time.size - points)
+        nodes = first[:, None] + np.arange(points)
+        away = at[row, None] - time[nodes]
+        out[row] = 0.0
+        for i in range(points):
+            beside = np.arange(points) != i
+            weights = away[:, beside] / (time[nodes[:, [i]]] - time[nodes[:, beside]])
+            out[row] += np.prod(weights, axis=1) * values[nodes[:, i]]
+        return out
+
+
+Rule = Hold | Linear | Nearest | Readings
 
 
 def check_increasing(time: Float[np.ndarray, " m"], clock: str) -> None:

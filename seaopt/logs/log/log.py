@@ -208,7 +208,7 @@ class Log:
         ----------
         rate_hz : float
             Of the new clock, which starts at the log's first sample; at least 0.8 of the log's own rate.
-        rule : Linear, Hold or Nearest, optional
+        rule : Linear, Hold, Nearest or Readings, optional
             Linear if left out. A line between samples is a low-pass filter: it attenuates by 0.9 dB at a quarter of the
             sample rate and 3.9 dB at half.
         steps : sequence of str, optional

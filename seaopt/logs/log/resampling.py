@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import LogError, require_number, suggestion
-from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule
+from seaopt.logs.log.alignment import Hold, Linear, Nearest, Readings, Rule
 from seaopt.logs.quality.clock import GAP, advise_clock, sample_rate_hz, split_at_gaps, timestamp_resolution
 from seaopt.signals import Recording
 
@@ -43,9 +43,10 @@ def resample(
     positive, or would alias, or no segment is long enough.
     """
     chosen = rule if rule is not None else Linear()
-    if not isinstance(chosen, Hold | Linear | Nearest):
+    if not isinstance(chosen, Hold | Linear | Nearest | Readings):
         raise LogError(
-            f"{log.source}: rule = {rule!r} is not a valid rule; expected Linear(), Hold() or Nearest(tolerance_s=...)"
+            f"{log.source}: rule = {rule!r} is not a valid rule; expected Linear(), Hold(), "
+            "Nearest(tolerance_s=...) or Readings()"
         )
     old_rate_hz = sample_rate_hz(period)
     rate_hz = require_number(rate_hz, "rate_hz", LogError)
@@ -80,7 +81,9 @@ def resample(
             continue
         new_time.append(grid)
         for name, parts in new_values.items():
-            values = fill_holes(time[segment], log.signals[name].values[segment], hole_s, held=name in steps)
+            values = log.signals[name].values[segment]
+            if name in steps or not isinstance(chosen, Readings):
+                values = fill_holes(time[segment], values, hole_s, held=name in steps)
             if name in steps:
                 parts.append(_average_steps(grid, time[segment], values, period, rate_hz))
             else:

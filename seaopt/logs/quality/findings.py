@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from typing import Any, Literal
@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from seaopt.formatting import format_count, format_figure, format_key
 from seaopt.logs.quality.channel import BEYOND, ChannelQuality
-from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality, advise_clock
+from seaopt.logs.quality.clock import JITTER_LIMIT, ClockQuality, advise_clock, measure_steps
 from seaopt.logs.quality.excitation import InputExcitation
 from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.lags import ChannelPair
@@ -70,8 +70,12 @@ class Finding:
         return asdict(self)
 
 
-def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Iterator[Finding]:
-    """Yield what is wrong with the clock."""
+def find_clock_faults(
+    clock: ClockQuality, time: Float[np.ndarray, " n"], channels: Iterable[ChannelQuality] = ()
+) -> Iterator[Finding]:
+    """Yield what is wrong with the clock. Where devices write rows in turn, by what their channels lack, rounding of
+    one clock is no explanation.
+    """
     for kind, rows, what in (
         ("time_missing", clock.not_numbers, "no number as time; remove these rows"),
         ("backwards", clock.backwards, "a time before that of the row ahead; sort the rows, or cut the log there"),
@@ -83,11 +87,16 @@ def find_clock_faults(clock: ClockQuality, time: Float[np.ndarray, " n"]) -> Ite
     share = clock.jitter_max / clock.period
     if share > JITTER_LIMIT:
         text = f"steps of time differ by up to {share:.0%} from the period of {clock.period:.4g} s"
-        if clock.rounded_only:
+        advice = (
+            _advise_on_holes(each.missing, time) for each in channels if each.missing.samples not in (0, time.size)
+        )
+        in_turn = next((each for each in advice if "resample" in each), None)
+        if clock.rounded_only and in_turn is None:
             text += f", which the rounding of the timestamps to {clock.rounding:.3g} s explains"
         else:
             text += f" (rms {clock.jitter_rms / clock.period:.1%})"
         remedy, keys = advise_clock(clock.period, rounded=clock.rounded_only)
+        remedy, keys = (remedy, keys) if in_turn is None else (_say_join(in_turn), [in_turn])
         yield Finding(
             kind="jitter",
             severity="error",
@@ -127,7 +136,7 @@ def find_channel_faults(
         )
         keys = _advise_on_holes(missing, time)
         if "resample" in keys:
-            text += f": a device with times of its own; log.resample(**{keys['resample']}) joins what it has"
+            text += f": {_say_join(keys)}"
         else:
             text += f": cut the log to its longest part without, log.between({', '.join(map(str, keys['slice_s']))})"
         keys = (keys,)
@@ -196,7 +205,7 @@ def find_channel_faults(
         )
 
 
-def _advise_on_holes(missing: RowRanges, time: Float[np.ndarray, " n"]) -> Mapping[str, Any]:
+def _advise_on_holes(missing: RowRanges, time: Float[np.ndarray, " n"]) -> dict[str, Any]:
     """Return the keys of a problem file for a log with missing samples: holes that are short and everywhere are
     bridged, else the log is cut.
     """
@@ -204,8 +213,18 @@ def _advise_on_holes(missing: RowRanges, time: Float[np.ndarray, " n"]) -> Mappi
     longest = int(np.max(missing.lengths))
     if longest > MOST_BRIDGED or (stop - start) > PART * np.ptp(time):
         return {"slice_s": [start, stop]}
-    period = float(np.median(np.diff(time)))
-    return {"resample": {"rate_hz": float(f"{1.0 / period:.6g}"), "bridge_s": float(f"{(longest + 1.5) * period:.3g}")}}
+    step = np.diff(time)
+    period = measure_steps(step[step > 0.0])[0]
+    bridge_s = float(f"{(longest + 1.5) * period:.3g}")
+    return {"resample": {"rate_hz": float(f"{1.0 / period:.6g}"), "bridge_s": bridge_s, "rule": {"readings": {}}}}
+
+
+def _say_join(keys: Mapping[str, Any]) -> str:
+    rate_hz, bridge_s = keys["resample"]["rate_hz"], keys["resample"]["bridge_s"]
+    return (
+        f"devices write at times of their own; log.resample(rate_hz={rate_hz:g}, bridge_s={bridge_s:g}, "
+        "rule=Readings(), steps=[INPUTS]) joins what they have"
+    )
 
 
 def _find_longest_without(runs: RowRanges, time: Float[np.ndarray, " n"]) -> tuple[float, float]:

@@ -185,7 +185,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
         channels = {name: replace(channel, hum=hums.get(name)) for name, channel in channels.items()}
     pairs = () if spectra is None else _correlate_pairs(spectra, inputs, channels)
     excitation = {} if spectra is None else _assess_inputs(spectra, inputs)
-    findings = [*find_clock_faults(clock, data.time)]
+    findings = [*find_clock_faults(clock, data.time, channels.values())]
     for channel in channels.values():
         may_drive = not inputs and channel.unit in ("", *INPUT_UNITS)
         findings += find_channel_faults(channel, data.time, may_drive=may_drive)

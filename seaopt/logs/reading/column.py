@@ -35,7 +35,7 @@ class Column:
         The column's own clock, where it is not the log's.
     clock_offset_s : float
         Seconds to add to its own clock.
-    align : Hold, Linear or Nearest, optional
+    align : Hold, Linear, Nearest or Readings, optional
         How it is aligned from its own clock to the log's.
     where : mapping of column to value, optional
         Read only the rows in which other columns have these values: a table of (name, value, time) holds many channels.

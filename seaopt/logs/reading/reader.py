@@ -17,7 +17,7 @@ from seaopt.errors import LogError, require_number, require_type
 from seaopt.files import write_text
 from seaopt.formatting import format_count
 from seaopt.logs.formats import Source, Window, open_source
-from seaopt.logs.log.alignment import Hold, Linear, Nearest, Rule, check_increasing
+from seaopt.logs.log.alignment import Hold, Linear, Nearest, Readings, Rule, check_increasing
 from seaopt.logs.log.log import Log
 from seaopt.logs.quality.faults import find_counter_losses
 from seaopt.logs.reading.column import Column, spell_column, suspect_wrap
@@ -58,7 +58,7 @@ def read_table(
     channels : mapping of channel name to str, int or Column, optional
         Which column is which channel; where it is left out, every column of numbers on the clock, named by its header
         without the unit's brackets.
-    align : Hold, Linear or Nearest, optional
+    align : Hold, Linear, Nearest or Readings, optional
         How channels of other clocks are aligned to this one; a Column's own rule takes precedence.
     window_s : tuple, optional
         Read only what lies between these times of the clock; formats with an index skip the rest of the file.
@@ -93,7 +93,13 @@ def read_table(
     if counter is not None:
         require_type(counter, Counter, "counter", "give a Counter", LogError)
     if align is not None:
-        require_type(align, (Hold, Linear, Nearest), "align", "give Hold(), Linear() or Nearest(...)", LogError)
+        require_type(
+            align,
+            (Hold, Linear, Nearest, Readings),
+            "align",
+            "give Hold(), Linear(), Nearest(...) or Readings()",
+            LogError,
+        )
     if window_s is not None:
         require_type(window_s, (tuple, list), "window_s", "give (start, stop)", LogError)
         edges = [require_number(edge, "window_s", LogError) for edge in window_s]

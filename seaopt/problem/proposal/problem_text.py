@@ -191,17 +191,16 @@ def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, intervie
     if scale < 0.0:
         interview.assume(f"sign:{column.name}")
         guesses.append("guessed: sign reversed, as it falls when the effort rises")
-    keys = _spell_clock(column, log) if column.clock else {}
-    if keys and role == log.roles.input and not column.header.measured:
-        keys["align"] = {"hold": {}}
+    rule = "readings" if role != log.roles.input else "linear" if column.header.measured else "hold"
+    keys = _spell_clock(column, log, rule) if column.clock else {}
     return f"{name} = {_spell_column(column.name, unit, scale, keys)}", "; ".join([*notes, *filter(None, guesses)])
 
 
-def _spell_clock(column: SurveyedColumn, log: DescribedLog) -> dict[str, object]:
-    """Return the keys of a column that has times of its own."""
+def _spell_clock(column: SurveyedColumn, log: DescribedLog, rule: str) -> dict[str, object]:
+    """Return the keys of a column that has times of its own, aligned by a rule."""
     stated = header_unit(column.clock)
     unit = {} if stated and is_unit(stated) else {"unit": log.survey.clock_units[column.clock]}
-    return {"time": {"column": column.clock, **unit}, "align": {"linear": {}}}
+    return {"time": {"column": column.clock, **unit}, "align": {rule: {}}}
 
 
 def _mark_role(column: str, doubt: str, interview: Interview) -> str:
@@ -230,11 +229,13 @@ def _describe_clock(log: DescribedLog) -> list[tuple[str, str]]:
         rows.append(('duplicates = "first"', f"{clock.repeated.size} times occur twice"))
     driver = log.roles.columns.get(log.roles.input)
     hole = 0 if driver is None else driver.hole
-    if hole and not clock.jitter_max > JITTER_LIMIT * clock.period:
+    if hole:
         rate = float(f"{clock.rate_hz:.3g}")
-        settings = f"rate_hz = {rate:.10g}, bridge_s = {(hole + 1.5) / rate:.3g}"
+        settings = (
+            f"rate_hz = {rate:.10g}, bridge_s = {max(hole + 1.5, BRIDGE) / rate:.3g}, rule = {{ readings = {{}} }}"
+        )
         rows.append((f"resample = {{ {settings} }}", "the input is in some rows only, with the others between them"))
-    if clock.jitter_max > JITTER_LIMIT * clock.period:
+    elif clock.jitter_max > JITTER_LIMIT * clock.period:
         if clock.rounded_only:
             rows.append(('resample = "restamp"', "the timestamps are rounded"))
         else:
