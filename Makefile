@@ -1,6 +1,8 @@
-# Each command sets up .venv by itself, from any Python >= 3.11; uv is used where it is present.
+# Each command sets up .venv by itself, from any Python >= 3.11; uv is used where it is present. The demo needs what a user
+# installs; the development tools, twice as much again, come with the first other command.
 VENV   := .venv
 BIN    := $(VENV)/bin
+PLAIN  := $(VENV)/.plain
 READY  := $(VENV)/.ready
 CACHE  := $(VENV)/cache
 export MPLCONFIGDIR := $(CURDIR)/$(CACHE)/matplotlib
@@ -22,10 +24,14 @@ INTERPRETED := tests/simulation tests/estimation/result/test_fit.py tests/estima
 setup: $(READY)
 
 $(READY): pyproject.toml constraints.txt tools/setup.sh
-	@sh tools/setup.sh $(VENV)
-	@touch $(READY)
+	@sh tools/setup.sh $(VENV) constraints.txt dev
+	@touch $(PLAIN) $(READY)
 
-demo: $(READY)
+$(PLAIN): pyproject.toml constraints.txt tools/setup.sh
+	@sh tools/setup.sh $(VENV)
+	@touch $(PLAIN)
+
+demo: $(PLAIN)
 	$(BIN)/seaopt demo -o out/demo
 
 test: $(READY)
