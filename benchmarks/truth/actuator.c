@@ -57,8 +57,10 @@ static double friction_level(const Parameters *p, double v, double spring, doubl
     return cold * coulomb * (1.0 + fall) + load * fabs(spring) / p->ratio;
 }
 
-/* Simulate n samples, dt apart, of a commanded current; `out` has n rows of q, phi, spring force, force_2. */
-void simulate(const double *parameters, const double *current, int n, double dt, int substeps, double *out) {
+/* Simulate n samples, dt apart, of a commanded current; `out` has n rows of q, phi, spring force, force_2. At each
+   sample `tick`, where it is not null, may read its row and set the current from then on: what closes a loop. */
+void simulate(const double *parameters, const double *current, int n, double dt, int substeps, double *out,
+              void (*tick)(int)) {
     const Parameters *p = (const Parameters *)parameters;
     const double h = dt / substeps;
     const double lag = p->current_loop > 0.0 ? 1.0 - exp(-6.283185307179586 * p->current_loop * h) : 1.0;
@@ -74,6 +76,7 @@ void simulate(const double *parameters, const double *current, int n, double dt,
             if (s == 0) {
                 double *row = out + 4 * i;
                 row[0] = q; row[1] = phi; row[2] = spring; row[3] = spring + p->carried * acceleration;
+                if (tick) tick(i);
             }
             const double t = i * dt + s * h;
             const int held = (int)floor((t - p->delay) / dt + 1e-9);

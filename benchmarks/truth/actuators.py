@@ -10,7 +10,7 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -108,17 +108,39 @@ class Actuator:
 
     def simulate(self, current: np.ndarray) -> dict[str, np.ndarray]:
         """Return what the sensors would read without noise."""
-        parameters, kind = _list_parameters(self), KINDS[self.kind]
-        rows = np.zeros((current.size, 4))
-        values = np.array([parameters[name] for name in _names()])
-        step, point = 1.0 / RATE_HZ, ctypes.POINTER(ctypes.c_double)
-        held = np.ascontiguousarray(np.round(current, 3))
-        arrays = (array.ctypes.data_as(point) for array in (values, held))
-        _library().simulate(*arrays, current.size, ctypes.c_double(step), SUBSTEPS, rows.ctypes.data_as(point))
-        q, phi, spring, outside = rows.T
+        kind = KINDS[self.kind]
+        q, phi, spring, outside = self._play(np.ascontiguousarray(np.round(current, 3)), 1.0 / RATE_HZ, None).T
         if kind.linear:
             return {"F1": spring, "F2": outside}
         return {"tau_s": spring, "theta_m": q} | ({"theta_l": phi} if self.link == "pendulum" else {})
+
+    def close(
+        self, law: Callable[[int, float, float], float], count: int, period: float, wait: int = 0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the current and the spring's force of a loop: `law` turns the number of a sample, the force and the
+        motor's position there into a current, which is put out `wait` samples later.
+        """
+        current, rows = np.zeros(count + wait), np.zeros((count, 4))
+
+        def tick(i: int) -> None:
+            current[i + wait] = law(i, float(rows[i, 2]), float(rows[i, 0]))
+
+        self._play(current, period, tick, rows)
+        return current[:count], rows[:, 2]
+
+    def _play(
+        self, current: np.ndarray, period: float, tick: Callable[[int], None] | None, rows: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return the rows of actuator.c; a tick may change the current."""
+        parameters = _list_parameters(self)
+        values = np.array([parameters[name] for name in _names()])
+        rows = np.zeros((current.size, 4)) if rows is None else rows
+        point, kind = ctypes.POINTER(ctypes.c_double), ctypes.CFUNCTYPE(None, ctypes.c_int)
+        values_at, current_at, rows_at = (array.ctypes.data_as(point) for array in (values, current, rows))
+        substeps = round(SUBSTEPS * RATE_HZ * period)
+        called = kind() if tick is None else kind(tick)
+        _library().simulate(values_at, current_at, len(rows), ctypes.c_double(period), substeps, rows_at, called)
+        return rows
 
 
 def _list_parameters(actuator: Actuator) -> dict[str, float]:

@@ -59,7 +59,7 @@ from seaopt.robustness.certificate.simulated import SIMULATIONS, STEPS
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.verification.verification import check_sensors
 
-CHECKS = (NOMINAL, DRAWS, FRICTION, IMPEDANCE, COMPENSATION, MEASURED, LOGS, STEPS, SIMULATIONS, CONSTRAINED)
+CHECKS = (NOMINAL, DRAWS, FRICTION, IMPEDANCE, COMPENSATION, MEASURED, STEPS, SIMULATIONS, CONSTRAINED, LOGS)
 SCHEDULE_CHECKS = (STRETCHES, JOINT_DRAWS, SWEEPS)  # of a schedule as a whole, after those at each of its values
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
 

@@ -1,0 +1,179 @@
+"""How often a certified law keeps its limits on actuators that are not the model, with and without the logs as judge.
+
+    python benchmarks/judge/run.py --fits 60 --seed 7 [--first 0] [--exact] [--json FILE] [--read FILE ...]
+
+Actuators, effects and logs are those of benchmarks/truth, which share nothing with seaopt. Each is fitted to one log,
+tuned with a reserve of 3 %, and certified. Then its law closes the loop around the actuator itself, in C: Ms is
+measured from a multisine on the command to the command, at two amplitudes with random phases, and a step is played. A
+law is *bad* where Ms is over its limit by more than the grace of the certificate, or the step overshoots by more than
+1.1 times the reference peak, or does not settle. With --exact nothing is missing from any model, and fits are not
+judged: a law that its log alone refuses, and that is not bad, was refused wrongly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "truth"))
+from actuators import KINDS, RATE_HZ, Actuator  # noqa: E402
+from run import FREE, draw_cases  # noqa: E402
+
+import seaopt as so  # noqa: E402
+from seaopt.errors import SeaoptError  # noqa: E402
+
+BANDWIDTH_HZ = {"screw": 25.0}
+OTHERS_HZ, RESERVE = 10.0, 0.03
+DIRECT: dict[str, Any] = {"measured": ("tau_s", "thetad_m"), "structure": "cascade"}  # no pid keeps its limits
+SHARES = (0.5, 0.2)  # of the log's rms, of the multisine on the command
+PHASES, PERIOD_S, GRACE, LOG_ROW = 3, 2.0, 1.05, "log_sensitivity"
+
+
+def make_case(actuator: Actuator, seed: int, seconds: float, diagnostics: bool) -> dict[str, Any]:
+    """Return what is certified of an actuator, and what its law does on it."""
+    rng, kind = np.random.default_rng(seed), KINDS[actuator.kind]
+    base = so.plants.high_impedance() if kind.linear else so.plants.rotary(link=actuator.link)
+    plant, free = so.plants.let_stick(base), FREE[kind.linear]
+    known = {name: value for name, value in actuator.truth.items() if name in plant.parameters}
+    params = plant.defaults.update(**known | {name: known[name] * 2.0 ** rng.uniform(-1, 1) for name in free})
+    readings = actuator.record(seconds=seconds, amplitude=1.0, seed=seed)
+    log = so.Log.from_arrays(**readings).restamp(rate_hz=RATE_HZ)
+    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
+    outputs = tuple(name for name in readings if name not in ("time", "I"))
+    experiment = so.Experiment(plant=plant, log=log, outputs=outputs, delay_s=delay, name="log0")
+    fit = so.fit([experiment], params.free(*free), diagnostics=diagnostics)
+    row: dict[str, Any] = {"fit_met": fit.met, "status": fit.status}
+    chosen = DIRECT if actuator.kind == "direct" else {"measured": "F1" if kind.linear else "tau_s"}
+    rms = float(np.std(readings["I"]))
+    spec = so.ControllerSpec(
+        bandwidth_hz=BANDWIDTH_HZ.get(actuator.kind, OTHERS_HZ), bandwidth_range_hz=(1.0, 100.0), reserve=RESERVE,
+        current_limit_A=kind.current, **chosen,
+    )  # fmt: skip
+    controller = so.tune(plant, fit, spec)
+    row["tuned"] = controller.met
+    if not controller.met:
+        return row
+    certificate = so.certify(controller, {"stand": plant}, fit, samples=500, simulations=False)
+    row["refused"] = [each.name for each in certificate.requirements if not each.met]
+    row |= {"certified": not {*row["refused"]} - {LOG_ROW}, "logs": [asdict(verdict) for verdict in certificate.logs]}
+    return row | play(actuator, controller, rms, rng)
+
+
+def play(actuator: Actuator, controller: so.Controller, rms: float, rng: np.random.Generator) -> dict[str, Any]:
+    """Return Ms of the loop around the actuator at two amplitudes, and without its dry friction, and a step."""
+    limit = controller.spec.level("max_sensitivity")
+    peaks = [measure_ms(actuator, controller, share * rms, rng) for share in SHARES]
+    overshoot, left = play_step(actuator, controller)
+    most = controller.spec.level("max_reference_peak")
+    return {
+        "ms": max(peaks), "peaks": peaks, "overshoot": overshoot, "left": left, "nominal_ms": controller.achieved.ms,
+        "bad": bool(max(peaks) > GRACE * limit or overshoot > 1.1 * most or left > 0.1),
+    }  # fmt: skip
+
+
+def close(actuator: Actuator, controller: so.Controller, reference: np.ndarray, extra: np.ndarray) -> Any:
+    """Return current and force of a loop, with a current that is added."""
+    law = {name: np.array(part) for name, part in controller.to_dict()["law"].items()}
+    a, b, c, d = (law[name] for name in "ABCD")
+    per, top, x = controller.command.per_effort, KINDS[actuator.kind].current, np.zeros(len(a))
+
+    def step(i: int, force: float, position: float) -> float:
+        nonlocal x
+        read = np.array([reference[i], force, position][: b.shape[1]])
+        effort = float(np.ravel(c @ x + d @ read)[0])
+        x = a @ x + b @ read
+        return float(np.clip(per * effort + extra[i], -top, top))
+
+    return actuator.close(step, reference.size, controller.sample_time_s, controller.compute_delay_samples)
+
+
+def measure_ms(actuator: Actuator, controller: so.Controller, rms: float, rng: np.random.Generator) -> float:
+    """Return the largest sensitivity at lines of a multisine: the mean over sets of phases."""
+    period = round(PERIOD_S / controller.sample_time_s)
+    lines = np.unique(np.round(np.geomspace(1.0, 120.0, 60) * PERIOD_S).astype(int))
+    responses = []
+    for _ in range(PHASES):
+        spectrum = np.zeros(period // 2 + 1, dtype=complex)
+        spectrum[lines] = np.exp(2j * np.pi * rng.uniform(size=lines.size))
+        extra = np.fft.irfft(spectrum, period)
+        extra *= rms / np.std(extra)
+        current, _ = close(actuator, controller, np.zeros(2 * period), np.tile(extra, 2))
+        responses.append(np.fft.rfft(current[period:])[lines] / np.fft.rfft(extra)[lines])
+    return float(np.max(np.abs(np.mean(responses, axis=0))))
+
+
+def play_step(actuator: Actuator, controller: so.Controller) -> tuple[float, float]:
+    """Return the largest force of a step over it, and the range of the last quarter over the step."""
+    count = round(3.0 / controller.sample_time_s)
+    size = 0.3 * KINDS[actuator.kind].current / controller.command.per_effort
+    _, force = close(actuator, controller, np.full(count, size), np.zeros(count))
+    return float(np.max(force) / size), float(np.ptp(force[-count // 4 :]) / size)
+
+
+def summarise(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield how often certified laws are bad, without the logs as judge and with them."""
+    done = [row for row in rows if "bad" in row]
+    certified = [row for row in done if row["certified"]]
+    refuted = [row for row in certified if LOG_ROW in row["refused"]]
+    kept = [row for row in certified if LOG_ROW not in row["refused"]]
+    fine = [row for row in refuted if not row["bad"]]
+    yield f"{len(rows)} cases, {len(done)} tuned; {sum(row['fit_met'] for row in done)} on fits that are met"
+    yield f"certified without the logs {len(certified)}, bad of these {sum(row['bad'] for row in certified)}"
+    yield f"certified with them        {len(kept)}, bad of these {sum(row['bad'] for row in kept)}"
+    yield f"refused by a log alone     {len(refuted)}, of which fine {len(fine)}"
+    others = [row for row in done if not row["certified"]]
+    also = sum(LOG_ROW in row["refused"] for row in others)
+    yield f"refused by other checks    {len(others)}, by a log too {also}, bad of these {sum(r['bad'] for r in others)}"
+
+
+def main() -> None:
+    """Run the cases that the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--fits", type=int, default=30)
+    parser.add_argument("--first", type=int, default=0, help="of a seed's cases, that is fitted first")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=15.0, help="length of each log")
+    parser.add_argument("--exact", action="store_true", help="nothing is missing from any model")
+    parser.add_argument("--pendulums", action="store_true", help="links that swing, too, whose fits take long")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--read", type=Path, nargs="*", help="print the table of kept cases, and run none")
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    if options.read:
+        rows = [row for file in options.read for row in json.loads(file.read_text())]
+        print("\n".join(summarise(rows)))
+        return
+    rng = np.random.default_rng(options.seed)
+    cases = list(draw_cases(options.first + options.fits, rng, locked=not options.pendulums))
+    for k, case in enumerate(cases[options.first :], options.first):
+        actuator, started = replace(case, effects={}) if options.exact else case, time.process_time()
+        row = asdict(actuator) | {"number": k}
+        try:
+            row |= make_case(actuator, 1000 * options.seed + k, options.seconds, not options.exact)
+        except SeaoptError as error:
+            row |= {"status": f"{type(error).__name__}: {error}"[:200]}
+        row["cpu_s"] = round(time.process_time() - started, 1)
+        rows.append(row)
+        found = f"Ms {row['ms']:.2f} ({row['nominal_ms']:.2f}) overshoot {row['overshoot']:.2f}" if "ms" in row else ""
+        said = "BAD" if row.get("bad") else ""
+        effects = ", ".join(actuator.effects) or "nothing missing"
+        print(
+            f"{k:4d} {actuator.kind:7s} {effects:28s} {row['cpu_s']:6.1f} s {found} {row.get('refused')} {said}",
+            flush=True,
+        )
+        if options.json:
+            options.json.write_text(json.dumps(rows, indent=1))
+    print("\n".join(summarise(rows)))
+
+
+if __name__ == "__main__":
+    main()
