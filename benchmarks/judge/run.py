@@ -6,8 +6,8 @@ Actuators, effects and logs are those of benchmarks/truth, which share nothing w
 tuned with a reserve of 3 %, and certified. Then its law closes the loop around the actuator itself, in C: Ms is
 measured from a multisine on the command to the command, at two amplitudes with random phases, and a step is played. A
 law is *bad* where Ms is over its limit by more than the grace of the certificate, or the step overshoots by more than
-1.1 times the reference peak, or does not settle. With --exact nothing is missing from any model, and fits are not
-judged: a law that its log alone refuses, and that is not bad, was refused wrongly.
+1.1 times the reference peak, or does not settle. With --exact nothing is missing from any model, and a law is judged by
+its log alone: one that is refused, and is not bad, was refused wrongly.
 """
 
 from __future__ import annotations
@@ -30,15 +30,16 @@ from run import FREE, draw_cases  # noqa: E402
 
 import seaopt as so  # noqa: E402
 from seaopt.errors import SeaoptError  # noqa: E402
+from seaopt.robustness.uncertainty.logs import judge_log  # noqa: E402
 
-BANDWIDTH_HZ = {"screw": 25.0}
+BANDWIDTH_HZ = {"screw": 25.0, "ankle": 15.0}
 OTHERS_HZ, RESERVE = 10.0, 0.03
 DIRECT: dict[str, Any] = {"measured": ("tau_s", "thetad_m"), "structure": "cascade"}  # no pid keeps its limits
 SHARES = (0.5, 0.2)  # of the log's rms, of the multisine on the command
 PHASES, PERIOD_S, GRACE, LOG_ROW = 3, 2.0, 1.05, "log_sensitivity"
 
 
-def make_case(actuator: Actuator, seed: int, seconds: float, diagnostics: bool) -> dict[str, Any]:
+def make_case(actuator: Actuator, seed: int, seconds: float, exact: bool) -> dict[str, Any]:
     """Return what is certified of an actuator, and what its law does on it."""
     rng, kind = np.random.default_rng(seed), KINDS[actuator.kind]
     base = so.plants.high_impedance() if kind.linear else so.plants.rotary(link=actuator.link)
@@ -50,7 +51,7 @@ def make_case(actuator: Actuator, seed: int, seconds: float, diagnostics: bool) 
     delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
     outputs = tuple(name for name in readings if name not in ("time", "I"))
     experiment = so.Experiment(plant=plant, log=log, outputs=outputs, delay_s=delay, name="log0")
-    fit = so.fit([experiment], params.free(*free), diagnostics=diagnostics)
+    fit = so.fit([experiment], params.free(*free), diagnostics=not exact)
     row: dict[str, Any] = {"fit_met": fit.met, "status": fit.status}
     chosen = DIRECT if actuator.kind == "direct" else {"measured": "F1" if kind.linear else "tau_s"}
     rms = float(np.std(readings["I"]))
@@ -62,6 +63,11 @@ def make_case(actuator: Actuator, seed: int, seconds: float, diagnostics: bool) 
     row["tuned"] = controller.met
     if not controller.met:
         return row
+    if exact:  # what other checks say of it does not matter
+        verdicts, _ = judge_log(controller, fit, experiment, spec.level("max_sensitivity"))
+        refused = any(verdict.outcome == "refuted" for verdict in verdicts)
+        row |= {"refused": [LOG_ROW] * refused, "certified": True, "logs": [asdict(verdict) for verdict in verdicts]}
+        return row | (play(actuator, controller, rms, rng) if refused else {"bad": False})
     certificate = so.certify(controller, {"stand": plant}, fit, samples=500, simulations=False)
     row["refused"] = [each.name for each in certificate.requirements if not each.met]
     row |= {"certified": not {*row["refused"]} - {LOG_ROW}, "logs": [asdict(verdict) for verdict in certificate.logs]}
@@ -158,7 +164,7 @@ def main() -> None:
         actuator, started = replace(case, effects={}) if options.exact else case, time.process_time()
         row = asdict(actuator) | {"number": k}
         try:
-            row |= make_case(actuator, 1000 * options.seed + k, options.seconds, not options.exact)
+            row |= make_case(actuator, 1000 * options.seed + k, options.seconds, options.exact)
         except SeaoptError as error:
             row |= {"status": f"{type(error).__name__}: {error}"[:200]}
         row["cpu_s"] = round(time.process_time() - started, 1)

@@ -42,6 +42,7 @@ from seaopt.robustness.verification.scenarios import STEP_SHARES
 
 PASSIVE = "passive_band_hz"
 LOG_SENSITIVITY = "log_sensitivity"
+NO_LOG = "no log of the fit is of a plant that is certified, so that none judges the law"
 LOG_SECONDS = 0.02  # that the logs of a fit take as a rule
 AMPLITUDES = 9  # looked at for the remark on bandwidth
 
@@ -94,6 +95,8 @@ def judge_logs(survey: Survey, _: Progress) -> Evidence:
     if survey.place is not None:
         logs = [each for each in logs if np.isclose(_find_log_place(survey.place[0], fit, each), survey.place[1])]
     found = [judge_log(controller, fit, experiment, limit) for experiment in logs]
+    if fit.experiments and not logs and survey.place is None:
+        found.append(((), NO_LOG))
     verdicts = tuple(verdict for of_log, _ in found for verdict in of_log)
     rows = (
         require_at_most(

@@ -31,7 +31,7 @@ from seaopt.control.loops.measured.plant import hold_response
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Experiment, Fit
 from seaopt.estimation.result.findings import Nuisance
-from seaopt.formatting import format_number
+from seaopt.formatting import format_number, join_words
 from seaopt.frequency.residual import ResidualResponse, measure_residual
 from seaopt.frequency.response import Lines
 from seaopt.frequency.sampled import sampled_response
@@ -99,6 +99,10 @@ def judge_log(
     controller: Controller, fit: Fit, experiment: Experiment, ms: float
 ) -> tuple[tuple[LogVerdict, ...], str]:
     """Return what a log says of a law that is to keep Ms, whole and where it was held out; or why it says nothing."""
+    there = {*experiment.outputs, *experiment.log.signals.keys() & experiment.plant.inputs.keys()}
+    needed = [controller.command.input, *(name for name in controller.signals if name in experiment.plant.outputs)]
+    if lacking := [name for name in needed if name not in there]:
+        return (), f"log {experiment.name} does not judge the law: it has no {join_words(lacking)}"
     try:
         parts = list(_list_records(fit, experiment, controller))
         found = [_judge(controller, fit.parameters, part, ms * (1.0 + GRACE)) for part in parts]
@@ -110,9 +114,6 @@ def judge_log(
 
 def _list_records(fit: Fit, experiment: Experiment, controller: Controller) -> Iterator[_Record]:
     """Yield a log with its simulation, and what was held out of it alone."""
-    lacking = {*controller.signals} & {*experiment.plant.outputs} - {*experiment.outputs}
-    if lacking or controller.command.input not in experiment.log.signals:
-        return
     predicted, n = fit.predict(experiment), len(experiment.log)
     names = [name for name in controller.signals if name in experiment.outputs]
     gain = np.array([predicted.own.gain[name] for name in names])[:, None]

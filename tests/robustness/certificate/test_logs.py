@@ -52,6 +52,12 @@ def record(params, size=0.0, seed=1, amplitude=2.0):
     return so.Log.from_arrays(time=time, I=current, F1=force)
 
 
+def simulate(plant, params):
+    log = record(params)
+    force = so.simulate(plant, params, log)["F2"]
+    return so.Log.from_arrays(time=log.time, I=log["I"], F2=force + np.random.default_rng(5).normal(size=len(log)))
+
+
 @pytest.fixture(scope="module")
 def fit_to(stand, thor):
     def fit(*sizes, validate=(), **options):
@@ -153,7 +159,15 @@ def test_values_without_logs_and_logs_of_other_plants_judge_nothing(stand, swing
     assert not certify(controller, stand, thor).logs
     of_swing = so.tune(swing, thor, SPEC)
     certificate = so.certify(of_swing, {"swing": swing}, right, samples=20, simulations=False)
-    assert not certificate.logs and not certificate.remarks
+    assert not certificate.logs
+    assert "no log of the fit is of a plant that is certified, so that none judges the law" in certificate.notes
+
+
+def test_log_without_what_the_law_reads_is_a_note(stand, thor, controller):
+    experiment = so.Experiment(plant=stand, log=simulate(stand, thor), outputs=("F2",), name="other")
+    certificate = certify(controller, stand, so.fit([experiment], thor.free("b_r"), diagnostics=False))
+    assert not certificate.logs
+    assert "log other does not judge the law: it has no F1" in certificate.notes
 
 
 def test_log_that_says_nothing_is_a_note(stand, thor, controller):
