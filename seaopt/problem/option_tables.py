@@ -103,12 +103,12 @@ def make_record(record: type[Any], table: BaseModel, **others: Any) -> Any:
     """Return a record with the options that a table states, and others that are given."""
     stated = {field.name: field for field in list_options(record) if field.name in type(table).model_fields}
     values = {
-        name: _make_value(getattr(table, name), field.kind) for name, field in stated.items() if name not in others
+        name: make_value(getattr(table, name), field.kind) for name, field in stated.items() if name not in others
     }
     return record(**values, **others)
 
 
-def _make_value(value: Any, kind: Any) -> Any:
+def make_value(value: Any, kind: Any) -> Any:
     """Return what a file's value stands for: a record of its table, or of true with its defaults."""
     records: list[Any] = [part for part in split_union(kind) if is_dataclass(part)]
     if not records:

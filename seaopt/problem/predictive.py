@@ -5,12 +5,12 @@ from __future__ import annotations
 from seaopt.control import MPCSpec
 from seaopt.errors import ProblemError
 from seaopt.options import list_options
-from seaopt.problem.option_tables import make_record
+from seaopt.problem.option_tables import make_record, make_value
 from seaopt.problem.references import RESPONSE
 from seaopt.problem.schema import MPC, ControllerTable, MPCTable, ProblemTable
 
-PLANNED = {field.name for field in list_options(MPCSpec)}
-SHARED = PLANNED & ControllerTable.model_fields.keys() - {"measured"}  # keys of [controller] that a plan has too
+PLANNED = {field.name: field.kind for field in list_options(MPCSpec)}
+SHARED = PLANNED.keys() & ControllerTable.model_fields.keys() - {"measured"}  # keys of [controller] that a plan has too
 
 
 def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
@@ -25,7 +25,7 @@ def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
         return None
     _check_keys(table, controller)
     assert isinstance(controller.measured, str)
-    shared = {name: getattr(controller, name) for name in SHARED}
+    shared = {name: make_value(getattr(controller, name), PLANNED[name]) for name in SHARED}
     return make_record(MPCSpec, table.mpc or MPCTable(), measured=controller.measured, **shared)
 
 

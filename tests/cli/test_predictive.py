@@ -10,8 +10,8 @@ from dataclasses import replace
 import pytest
 
 import seaopt as so
-from seaopt.control import export_mpc
-from seaopt.control.mpc.stored import describe_mpc
+from seaopt.control import Prefilter, export_mpc
+from seaopt.control.mpc.stored import check_described, describe_mpc
 from seaopt.files import to_json
 from seaopt.problem.stages import certify_problem, check_mpc_file, design_mpc, tune_problem
 
@@ -108,6 +108,7 @@ bandwidth_hz = 10
 max_sensitivity = 2.0
 max_complementary = 2.0
 current_limit_A = 9.0
+prefilter = { order = "first_order", corner_hz = 40 }
 [impedance]
 plant = "free"
 stiffness = 20
@@ -126,6 +127,8 @@ def test_a_plan_renders_an_impedance_that_is_certified_and_exported(folder):
     assert controller.outer.stiffness == 20.0 and controller.outer.plant == "free"
     mpc = design_mpc(problem, problem.parameters)
     assert pickle.loads(pickle.dumps(mpc)).outer == mpc.outer == controller.outer
+    assert mpc.spec.reference_filter == Prefilter(corner_hz=40.0)
+    check_described(json.loads(to_json(describe_mpc(mpc))), mpc, source="", problem="", remedy="")
     rendering = so.certify(mpc, problem.certified_plants(), problem.parameters, samples=3, runs=1).impedance
     assert rendering.plant == "free" and rendering.rendering.impedance.damping == 2.0
     export_mpc(mpc, folder / "code")

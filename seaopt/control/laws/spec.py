@@ -206,26 +206,10 @@ class ControllerSpec(LoopSpec):
                 raise ControlError(
                     f"{name} = {value!r} is a {type(value).__name__}; give a {kind.__name__}, in a file {name} = true"
                 )
-        prefilter: Any = self.prefilter
-        if not isinstance(prefilter, Prefilter | None) and prefilter not in PREFILTER_ORDERS:
-            raise ControlError(
-                f"prefilter = {prefilter!r} is not known; {suggestion(str(prefilter), PREFILTER_ORDERS)}; or give a "
-                "Prefilter"
-            )
-        chosen, highest = self.reference_filter, HIGHEST_CORNER * self.sample_rate_hz
-        for name, part in (("notch", notch), ("prefilter", chosen), ("link_feedforward", path)):
-            if part is None:
-                continue
-            check_options(part, ControlError, f"{name}.")
-            for field in fields(part):
-                value = getattr(part, field.name)
-                if field.name.endswith("_hz") and value and not LOWEST_HZ <= value <= highest:
-                    raise ControlError(f"{name}.{field.name} = {value!r} is not {LOWEST_HZ:g} to {highest:g}")
-        if chosen is not None and chosen.damping is not None and not chosen.is_second_order:
-            raise ControlError(
-                f"prefilter.damping = {chosen.damping!r} is of a filter of second order; leave it out, or give "
-                'order = "second_order"'
-            )
+        check_prefilter(self.prefilter, self.sample_rate_hz)
+        for name, part in (("notch", notch), ("link_feedforward", path)):
+            if part is not None:
+                _check_part(name, part, self.sample_rate_hz)
         if path is not None and path.measured in list_names(self.measured):
             raise ControlError(
                 f'link_feedforward.measured = "{path.measured}" is fed back already; measure the link\'s motion'
@@ -234,8 +218,7 @@ class ControllerSpec(LoopSpec):
     @property
     def reference_filter(self) -> Prefilter | None:
         """The prefilter with its fields; None without one."""
-        stated = self.prefilter
-        return Prefilter(order=stated) if isinstance(stated, str) else stated
+        return check_prefilter(self.prefilter, self.sample_rate_hz)
 
     @property
     def regulated(self) -> str:
@@ -310,3 +293,30 @@ def check_command_limits(current_limit_A: float | None, command_limit: float | N
         if value is not None and not 0.0 < value <= LARGEST and value != math.inf:
             kind = "not positive" if not value > 0.0 else f"above {LARGEST:g}"
             raise ControlError(f"{name} = {value:g} is {kind}; give the motor's limit")
+
+
+def check_prefilter(stated: Any, sample_rate_hz: float) -> Prefilter | None:
+    """Return a prefilter with its fields; None without one. Raises ControlError: it is none, or out of range."""
+    if not isinstance(stated, Prefilter | None) and stated not in PREFILTER_ORDERS:
+        raise ControlError(
+            f"prefilter = {stated!r} is not known; {suggestion(str(stated), PREFILTER_ORDERS)}; or give a Prefilter"
+        )
+    chosen = Prefilter(order=stated) if isinstance(stated, str) else stated
+    if chosen is not None:
+        _check_part("prefilter", chosen, sample_rate_hz)
+        if chosen.damping is not None and not chosen.is_second_order:
+            raise ControlError(
+                f"prefilter.damping = {chosen.damping!r} is of a filter of second order; leave it out, or give "
+                'order = "second_order"'
+            )
+    return chosen
+
+
+def _check_part(name: str, part: Notch | LinkFeedforward | Prefilter, sample_rate_hz: float) -> None:
+    """Refuse a filter's numbers that are out of range."""
+    check_options(part, ControlError, f"{name}.")
+    highest = HIGHEST_CORNER * sample_rate_hz
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if field.name.endswith("_hz") and value and not LOWEST_HZ <= value <= highest:
+            raise ControlError(f"{name}.{field.name} = {value!r} is not {LOWEST_HZ:g} to {highest:g}")

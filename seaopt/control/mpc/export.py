@@ -95,11 +95,12 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "KNOTS": prediction.knots.size, "ROWS": len(prediction.rows), "SLEWS": len(prediction.M),
         "SIGNALS": len(outputs.names), "SAMPLES": outputs.samples, "PREVIEW": spec.preview_samples,
         "HORIZON": spec.samples, "MAX_ITERATIONS": spec.max_iterations, "OUTER": int(mpc.outer is not None),
+        "PREFILTER": 0 if spec.low_pass is None else spec.low_pass.den.size - 1,
     }  # fmt: skip
     numbers = {
         "limit": mpc.command_limit, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
         "offset": float(kalman.offset[0]), "violation": VIOLATION, "penalty": PENALTY, "wide": WIDE,
-        "slack_unit": SLACK_UNIT, "lag": spec.lag_s / spec.sample_time_s,
+        "slack_unit": SLACK_UNIT, "lag": prediction.lag_s / spec.sample_time_s,
     }  # fmt: skip
     arrays = {
         "A": kalman.A, "B": kalman.B[:, 0], "late": kalman.late[:, 0], "C": kalman.C[0],
@@ -107,6 +108,8 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "F": prediction.F, "M": prediction.M, "R": prediction.R, "shift": mpc.shift, "free": outputs.free,
         "forced": outputs.forced, "static": outputs.static, "centre": outputs.middle / outputs.half,
     }  # fmt: skip
+    if spec.low_pass is not None:
+        arrays |= {"prefilter_num": spec.low_pass.num, "prefilter_den": spec.low_pass.den}
     units = {
         "COMMAND": mpc.actuation.word,
         "COMMAND_UNIT": mpc.actuation.unit,

@@ -19,6 +19,7 @@ class ForcePlant:
     late: Float[np.ndarray, " nx"]  # b', where the drive's delay leaves a part of a sample
     c: Float[np.ndarray, " nx"]
     w: Float[np.ndarray, " nx"]  # the row whose square the cost weighs: force and lag times its rate
+    lag_s: float
     gain: float  # N/A at rest
     sample_time_s: float
 

@@ -21,6 +21,7 @@ and the step says so.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import field, replace
@@ -48,7 +49,7 @@ from seaopt.control.mpc.force_plant import ForcePlant
 from seaopt.control.mpc.knots import interpolate_knots, spread_knots
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.output_bounds import SLACK_UNIT, bound_outputs
-from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, tune_regulator
+from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, find_plan_bandwidth, tune_regulator
 from seaopt.control.mpc.quadratic_program import (
     PENALTY,
     WIDE,
@@ -58,7 +59,7 @@ from seaopt.control.mpc.quadratic_program import (
     stack_hessian,
 )
 from seaopt.control.mpc.spec import MPCSpec
-from seaopt.control.mpc.step import MPCState, MPCStep
+from seaopt.control.mpc.step import MPCState, MPCStep, shape_references
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.estimation import Fit
@@ -249,7 +250,17 @@ class ForceMPC(LoopDelays, Result, Worded):
         """Remarks besides the limits, one sentence each."""
         proof = () if self.friction is None else (f"{self.friction}, while no limit is active",)
         limit = limit_notes(self.actuation, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None)
-        return (*self.spec.lifted_notes, *self.warnings, *limit, *proof)
+        return (*self.spec.lifted_notes, *self.warnings, *limit, *self._filter_notes(), *proof)
+
+    def _filter_notes(self) -> tuple[str, ...]:
+        """Return what the prefilter is, and the bandwidth without it."""
+        chosen = self.spec.reference_filter
+        if chosen is None:
+            return ()
+        loop, plan, scale = self.close(*self.design), self.unlimited(), self.per_effort
+        bare = replace(loop, law=replace(plan, b=plan.b / scale, d=plan.d / scale)).figures().bandwidth_hz
+        kind = chosen.order.replace("_", " ")
+        return (f"prefilter of {kind} at {chosen.corner_hz:.4g} Hz; without it the bandwidth is {bare:.4g} Hz",)
 
     @property
     def start(self) -> MPCState:
@@ -261,6 +272,7 @@ class ForceMPC(LoopDelays, Result, Worded):
             plan=np.zeros(n),
             sides=np.zeros(m, dtype=int),
             age=self.spec.samples,
+            shaped=() if self.spec.low_pass is None else (0.0,) * (self.spec.low_pass.den.size - 1),
         )
 
     def step(self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float) -> MPCStep:
@@ -282,7 +294,9 @@ class ForceMPC(LoopDelays, Result, Worded):
             A reference is not a finite number within +-1e15, or there are more of them than the specification says.
         """
         began = time.perf_counter()
-        references = self._read_references(reference_N)
+        references, shaped = self._read_references(reference_N), state.shaped
+        if self.spec.low_pass is not None:
+            references, shaped = shape_references(self.spec.low_pass, shaped, references)
         limit, last, seen = self.command_limit, state.current_A, state.gate
         most = limit if self.heat is None else min(limit, self.heat.limit(state.heat))
         if self.gate is not None:
@@ -315,7 +329,16 @@ class ForceMPC(LoopDelays, Result, Worded):
             status=status or solution.status,
             target_N=float(targets[-1]),
             slack=0.0 if status else SLACK_UNIT * float(np.max(theta[shifted.size :], initial=0.0)),
-            state=MPCState(kalman=kalman, current_A=current, plan=planned, sides=sides, age=age, gate=seen, heat=heat),
+            state=MPCState(
+                kalman=kalman,
+                current_A=current,
+                plan=planned,
+                sides=sides,
+                age=age,
+                gate=seen,
+                heat=heat,
+                shaped=shaped,
+            ),
             force_N=float(self.kalman.C[0] @ corrected),
             iterations=solution.iterations,
             step_time_s=time.perf_counter() - began,
@@ -352,7 +375,7 @@ class ForceMPC(LoopDelays, Result, Worded):
         slopes = np.zeros(len(prediction.M))
         if slopes.size:
             slopes[0] = (last_A - u_s) / self.spec.slew_per_sample_A
-        lag = self.spec.lag_s / self.spec.sample_time_s
+        lag = prediction.lag_s / self.spec.sample_time_s
         delta = targets[:-1] - targets[-1] + lag * np.diff(targets)
         gradient = prediction.F @ np.append(xi, last_A - u_s) + prediction.R @ delta
         under, over = prediction.outputs.limits(np.append(xi, last_A - u_s), u_s + drift, WIDE)
@@ -417,7 +440,7 @@ class ForceMPC(LoopDelays, Result, Worded):
         return self.kalman.go_on(line, corrected, innovation)
 
     def unlimited(self) -> Law:
-        """Return what the controller is as long as no limit is active: from reference and measurement to current."""
+        """Return the plan as long as no limit is active: from its reference and the measurement to current."""
         gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.command_limit
         rest, kalman, start = self.rest, self.kalman, self.kalman.start
         n, delay = len(kalman.A), kalman.delay_samples
@@ -459,7 +482,13 @@ class ForceMPC(LoopDelays, Result, Worded):
     def law(self) -> Law:
         """What it is while no limit is active, from reference and measurement to effort."""
         law, scale = self.unlimited(), self.per_effort
-        return replace(law, b=law.b / scale, d=law.d / scale)
+        a, b, c, d = law.a, law.b / scale, law.c, law.d / scale
+        if self.spec.low_pass is not None:
+            inner, into, seen, direct = self.spec.low_pass.state_space()
+            a = np.block([[a, np.outer(b[:, 0], seen)], [np.zeros((into.size, c.size)), inner]])
+            b = np.vstack([b * [direct, 1.0], np.column_stack([into, 0.0 * into])])
+            c, d = np.append(c, d[0] * seen), d * [direct, 1.0]
+        return replace(law, a=a, b=b, c=c, d=d)
 
     def describe_limits(self) -> str:
         """Return the limits of the command and its rate, as text."""
@@ -571,16 +600,23 @@ def _design(
     nx = digital.b.size
     a, _, c, _ = state_space(plant, completed)
     rate = c[list(plant.outputs).index(spec.measured)] @ a  # of the force, without the current's own part
-    sampled = ForcePlant(
-        a=digital.a,
-        b=kalman.B[:nx, 0],
-        late=kalman.late[:nx, 0],
-        c=digital.c[0],
-        w=digital.c[0] + spec.lag_s * rate,
-        gain=gain,
-        sample_time_s=spec.sample_time_s,
-    )
-    regulator = tune_regulator(sampled, spec.bandwidth_hz)
+
+    def make_plant(plan_hz: float) -> ForcePlant:
+        lag_s = spec.decay / (2.0 * math.pi * plan_hz)
+        return ForcePlant(
+            a=digital.a,
+            b=kalman.B[:nx, 0],
+            late=kalman.late[:nx, 0],
+            c=digital.c[0],
+            w=digital.c[0] + lag_s * rate,
+            lag_s=lag_s,
+            gain=gain,
+            sample_time_s=spec.sample_time_s,
+        )
+
+    plan_hz = find_plan_bandwidth(make_plant, spec.bandwidth_hz, spec.low_pass)
+    sampled = make_plant(plan_hz)
+    regulator = tune_regulator(sampled, plan_hz)
     knots = spread_knots(spec.samples, spec.moves)
     outputs = bound_outputs(spec.bounds, kalman, sampled, interpolate_knots(knots), limit)
     preview = max(spec.preview_samples - kalman.delay_samples, 0)

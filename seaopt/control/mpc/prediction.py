@@ -24,12 +24,14 @@ and :math:`\delta` adds to the gradient. Bounds of outputs are in `output_bounds
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.force_plant import ForcePlant
 from seaopt.control.mpc.knots import interpolate_knots
 from seaopt.control.mpc.output_bounds import OutputBounds
@@ -37,6 +39,7 @@ from seaopt.errors import ControlError
 from seaopt.records import record
 
 WEIGHTS = (1e-9, 1e9)  # of rho, over the square of the current per force
+FASTEST_PLAN = 4.0  # times the bandwidth that is asked behind a prefilter
 BELOW = 1000  # frequencies of the three decades below the bandwidth at which the force must follow
 
 
@@ -62,6 +65,7 @@ class HorizonProgram:
     F: Float[np.ndarray, "n s"]
     # slopes between knots over the slew limit, if there is one; the first row is the step from the last current
     M: Float[np.ndarray, "m n"]
+    lag_s: float  # with which a force error dies out at no cost
     # of the differences to the last reference known, at as many samples as can be known ahead
     R: Float[np.ndarray, "n p"]
     outputs: OutputBounds
@@ -89,20 +93,11 @@ def tune_regulator(plant: ForcePlant, bandwidth_hz: float) -> Regulator:
     """Return the regulator whose force follows its reference, within 3 dB, up to a frequency; by a search for rho."""
     from scipy.optimize import brentq  # deferred: scipy is slow to load
 
-    A, b = plant.add_command()
-    resting = plant.rest / plant.gain  # x_s per newton
-    below, row = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW), np.append(plant.c, 0.0)
-
-    def tracking(candidate: Regulator, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
-        closed = A - np.outer(b, np.append(candidate.K_x, candidate.K_u))
-        drive = b * (candidate.K_x @ resting + candidate.K_u / plant.gain)
-        inner = np.exp(2j * np.pi * f * plant.sample_time_s)[:, None, None] * np.eye(b.size) - closed
-        return np.abs(np.linalg.solve(inner, drive[None, :, None])[..., 0] @ row)
+    below = bandwidth_hz * np.geomspace(1e-3, 1.0, BELOW)
 
     def excess(log_rho: float) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth; it falls with the weight."""
-        return float(np.log(tracking(solve_regulator(plant, float(np.exp(log_rho))), below[-1:])[0] / HALF_POWER))
+        return float(np.log(_track(plant, solve_regulator(plant, float(np.exp(log_rho))), below[-1:])[0] / HALF_POWER))
 
     low, high = np.log(WEIGHTS).tolist()
     if excess(low) < 0.0:
@@ -114,13 +109,46 @@ def tune_regulator(plant: ForcePlant, bandwidth_hz: float) -> Regulator:
         raise ControlError(f"bandwidth_hz = {bandwidth_hz:g} is slower than any weight makes it; raise it")
     root: Any = brentq(excess, low, high, xtol=1e-12)
     regulator = solve_regulator(plant, float(np.exp(root)))
-    dips = np.flatnonzero(tracking(regulator, below) < 0.99 * HALF_POWER)
+    dips = np.flatnonzero(_track(plant, regulator, below) < 0.99 * HALF_POWER)
     if dips.size:
         raise ControlError(
             f"the force is lost near {below[dips[0]]:.3g} Hz, far below bandwidth_hz = {bandwidth_hz:g}: the plant "
             "has a zero there that no controller fills; design on the stand"
         )
     return regulator
+
+
+def _track(plant: ForcePlant, candidate: Regulator, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
+    (A, b), row = plant.add_command(), np.append(plant.c, 0.0)
+    closed = A - np.outer(b, np.append(candidate.K_x, candidate.K_u))
+    drive = b * (candidate.K_x @ (plant.rest / plant.gain) + candidate.K_u / plant.gain)
+    inner = np.exp(2j * np.pi * f * plant.sample_time_s)[:, None, None] * np.eye(b.size) - closed
+    return np.abs(np.linalg.solve(inner, drive[None, :, None])[..., 0] @ row)
+
+
+def find_plan_bandwidth(
+    make_plant: Callable[[float], ForcePlant], bandwidth_hz: float, low_pass: TransferFunction | None
+) -> float:
+    """Return the bandwidth of a plan, of which `make_plant` gives the plant, that makes one behind a low-pass."""
+    if low_pass is None:
+        return bandwidth_hz
+    from scipy.optimize import brentq  # deferred: scipy is slow to load
+
+    at, period = np.array([bandwidth_hz]), make_plant(bandwidth_hz).sample_time_s
+    shaped = float(np.abs(low_pass.response(at, period))[0])
+
+    def excess(plan_hz: float) -> float:
+        plant = make_plant(plan_hz)
+        return float(_track(plant, tune_regulator(plant, plan_hz), at)[0]) * shaped / HALF_POWER - 1.0
+
+    fastest = min(FASTEST_PLAN * bandwidth_hz, 0.24 / period)
+    if not fastest > bandwidth_hz or excess(fastest) < 0.0:
+        raise ControlError(
+            f"bandwidth_hz = {bandwidth_hz:g}: no plan has it behind the prefilter; raise its corner, or ask for less"
+        )
+    found: Any = brentq(excess, bandwidth_hz, fastest, xtol=1e-6 * bandwidth_hz)
+    return float(found)
 
 
 def condense(
@@ -158,6 +186,7 @@ def condense(
         H=0.5 * (H + H.T) * scale,
         F=F * scale,
         M=slopes,
+        lag_s=plant.lag_s,
         R=R * scale,
         outputs=outputs,
         rows=np.vstack([np.hstack([limits, slackless]), outputs.rows()]),

@@ -12,7 +12,9 @@ import numpy as np
 
 from seaopt.control.laws.delay import LoopSpec, check_delays
 from seaopt.control.laws.limits import BY_NAME, Limit
-from seaopt.control.laws.spec import ControllerSpec, Level
+from seaopt.control.laws.spec import HIGHEST_CORNER, ControllerSpec, Level, check_prefilter
+from seaopt.control.laws.structures import Prefilter, PrefilterOrder
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.errors import ControlError, require_type
 from seaopt.options import check_options, list_options, option
@@ -21,6 +23,7 @@ from seaopt.records import record
 NO_SLEW_LIMIT = 1e12  # A/s, far above which the plan's rows for it vanish in rounding
 MAX_HORIZON_SAMPLES = 500  # of a horizon
 MAX_MPC_DELAY_SAMPLES = 100
+FILTER_DAMPING = 0.7  # of a prefilter that states none
 MAX_MPC_ITERATIONS = 10_000
 MPC_BANDWIDTH_TOLERANCE = 0.02  # the weight makes the bandwidth of a plan with every current free; few cost accuracy
 MPC_LIMITS = (  # of the table of limits, those of a loop without gains
@@ -88,6 +91,11 @@ class MPCSpec(LoopSpec):
     moves: int = option(
         "Free commands in a plan, with straight lines between.", default=12, least=2, most=MAX_HORIZON_SAMPLES
     )
+    prefilter: PrefilterOrder | Prefilter | None = option(
+        "A low-pass of the reference alone, of this order, before the plan, whose bandwidth rises so that bandwidth_hz "
+        "holds with it. Left out, its corner is at twice bandwidth_hz, and its damping 0.7.",
+        default=None,
+    )
     largest_force_N: float | None = option(
         "A force that the limit of the command must be able to hold; a limit too low for it is refused.",
         default=None,
@@ -144,6 +152,7 @@ class MPCSpec(LoopSpec):
                 f"{MAX_HORIZON_SAMPLES}"
             )
 
+        check_prefilter(self.prefilter, self.sample_rate_hz)
         self._check_bounds()
         for limit in MPC_LIMITS:
             if limit.has_field:
@@ -165,9 +174,19 @@ class MPCSpec(LoopSpec):
             )
 
     @property
-    def lag_s(self) -> float:
-        """Time constant with which a force error dies out at no cost, s."""
-        return self.decay / (2.0 * math.pi * self.bandwidth_hz)
+    def reference_filter(self) -> Prefilter | None:
+        """The prefilter with its numbers; None without one."""
+        chosen, highest = check_prefilter(self.prefilter, self.sample_rate_hz), HIGHEST_CORNER * self.sample_rate_hz
+        if chosen is None:
+            return None
+        damping = (chosen.damping or FILTER_DAMPING) if chosen.is_second_order else None
+        return replace(chosen, corner_hz=chosen.corner_hz or min(2.0 * self.bandwidth_hz, highest), damping=damping)
+
+    @property
+    def low_pass(self) -> TransferFunction | None:
+        """The prefilter as it runs; None without one."""
+        chosen = self.reference_filter
+        return None if chosen is None else chosen.filters(self.sample_time_s)[0]
 
     @property
     def limits(self) -> tuple[Limit, ...]:

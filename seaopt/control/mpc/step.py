@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.laws.plausibility import GateState
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import EstimatorState
 from seaopt.plants.motor.heat_guard import COLD
 from seaopt.records import record
@@ -30,6 +31,8 @@ class MPCState:
         What the plausibility gate, where there is one, has seen; its `status` is "ok", "held" or "fault".
     heat : (float, float)
         Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
+    shaped : tuple of float
+        What the prefilter, where there is one, keeps.
     """
 
     kalman: EstimatorState
@@ -39,6 +42,7 @@ class MPCState:
     age: int
     gate: GateState = GateState()
     heat: tuple[float, float] = COLD
+    shaped: tuple[float, ...] = ()
 
 
 @record(eq=False)
@@ -77,3 +81,16 @@ class MPCStep:
     slack: float
     iterations: int
     step_time_s: float
+
+
+def shape_references(
+    low_pass: TransferFunction, kept: tuple[float, ...], references: Float[np.ndarray, " r"]
+) -> tuple[Float[np.ndarray, " r"], tuple[float, ...]]:
+    """Return references that are known ahead behind a filter, and what that keeps after the first (transposed form)."""
+    (first, *num), (_, *den) = low_pass.num.tolist(), low_pass.den.tolist()
+    shaped, states = np.empty(references.size), [kept]
+    for k, reference in enumerate(references.tolist()):
+        state = states[-1]
+        shaped[k] = out = first * reference + state[0]
+        states.append(tuple(b * reference - a * out + s for b, a, s in zip(num, den, (*state[1:], 0.0), strict=True)))
+    return shaped, states[1]

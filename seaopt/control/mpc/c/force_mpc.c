@@ -32,6 +32,17 @@ real force_mpc_outer(force_mpc *s, real reference, real position) {
 }
 #endif
 
+#if FORCE_MPC_PREFILTER
+/* A reference behind its low-pass, in transposed form. */
+static real shape(real *state, real reference) {
+  real out = mpc_prefilter_num[0] * reference + state[0];
+  for (int i = 0; i < FORCE_MPC_PREFILTER; i++)
+    state[i] = mpc_prefilter_num[i + 1] * reference - mpc_prefilter_den[i + 1] * out +
+               (i + 1 < FORCE_MPC_PREFILTER ? state[i + 1] : 0);
+  return out;
+}
+#endif
+
 static real clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
 
 /* The limit of the command at this sample. */
@@ -193,10 +204,19 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
 #endif
   admissible_rest(limit_of(s), drift, &least, &most);
   real last = s->reference, rest = 0;
+#if FORCE_MPC_PREFILTER
+  real shaped[FORCE_MPC_PREFILTER];
+  memcpy(shaped, s->shaped, sizeof shaped);
+#endif
   for (int i = 0; i <= PREVIEW; i++) {
     if (i < count && is_number(references[i])) last = references[i];
     if (i == 0) s->reference = last;
-    rest = clip(last / mpc_static_gain - drift, least, most);
+    real asked = last;
+#if FORCE_MPC_PREFILTER
+    asked = shape(shaped, last);
+    if (i == 0) memcpy(s->shaped, shaped, sizeof shaped);
+#endif
+    rest = clip(asked / mpc_static_gain - drift, least, most);
     target[i] = mpc_static_gain * (rest + drift);
   }
   delta[KNOWN] = 0;

@@ -27,6 +27,9 @@ typedef struct {
   force_mpc_real outer_state, outer_last; /* what is taken off the link's next difference, the last reference asked */
   int outer_known;
 #endif
+#if FORCE_MPC_PREFILTER
+  force_mpc_real shaped[FORCE_MPC_PREFILTER]; /* what the low-pass of the reference keeps */
+#endif
 #if FORCE_MPC_HEAT
   double rise_winding, rise_case; /* K above the ambient, as estimated; a reset takes both for cold */
   double limit;                   /* of the command at this sample: it falls as the winding warms up */
