@@ -260,7 +260,8 @@ def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:
 
 def _list_cures(fit: Fit) -> tuple[str, ...]:
     """Return the lines to write for the likely cause that is named first. What is not told from zero is not to be
-    freed, nor how sharp friction is: a search for that takes long and ends nowhere.
+    freed, nor how sharp friction is: a search for that takes long and ends nowhere. What comes with a part comes
+    with its line.
     """
     causes = (each for each in fit.findings if each.kind == "cause" and (each.preferred or each.sticks))
     cause = next(causes, None)
@@ -268,7 +269,12 @@ def _list_cures(fit: Fit) -> tuple[str, ...]:
         return ()
     sticking = ["sticks = true in [plant.NAME]"] if cause.sticks else []
     apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}
-    return tuple(filter(None, [*sticking, *(spell_cure(name, value) for name, value in apart.items())]))
+    added = {name: row.proposal.replace("\n", " ") for row in reversed(fit.hypotheses) for name in row.frees}
+    lines = (
+        added[name] if name in added and name not in fit.parameters else spell_cure(name, value)
+        for name, value in apart.items()
+    )
+    return tuple(dict.fromkeys(filter(None, [*sticking, *lines])))
 
 
 def spell_cure(name: str, value: float) -> str:
