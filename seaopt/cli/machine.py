@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -19,7 +21,8 @@ from seaopt.cli.terminal import Amount, Terminal
 from seaopt.control import Controller, ControllerSpec, ScheduledController
 from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
-from seaopt.files import read_json, to_json, write_json
+from seaopt.files import read_json, to_json, write_json, write_text
+from seaopt.logs import write_log
 from seaopt.machine import Acceptance, BringUp, Stage, accept, bring_up
 from seaopt.machine.acceptance import take_ranges
 from seaopt.machine.bringup_files import write_stage
@@ -35,6 +38,19 @@ from seaopt.signals import REFERENCE
 
 FILE, PAGE = "acceptance.json", "acceptance.html"
 BRING_UP = "bringup"  # the folder of the stages
+AGAIN = "again"  # the folder of accepted logs, for a fit
+TABLES = """# A loop carries noise back into its command: fit such logs by prediction errors.
+# In the problem file: [fit] with method = "prediction_error", and these tables.
+"""
+TABLE = """
+[[experiment]]
+name = "{name}"
+plant = "{plant}"
+log = "{log}"
+time = "time [s]"
+inputs = {{ {inputs} }}
+outputs = {{ {outputs} }}
+"""
 
 
 def accept_logs(
@@ -79,7 +95,10 @@ def accept_logs(
             ranges=take_ranges(controller, session.problem.ranges),
         )
     content = write(result, session, logs)
-    return _show(result, content, [folder / FILE, folder / PAGE], json=json, amount=amount)
+    again = write_again(result, session)
+    if again:
+        errors.wrap(f"note: to fit these logs too, put the tables of {again[-1]} into the problem file")
+    return _show(result, content, [folder / FILE, folder / PAGE, *again], json=json, amount=amount)
 
 
 def _show(
@@ -120,6 +139,8 @@ def _list_units(controller: Controller) -> dict[str, str]:
     outputs = {} if controller.design is None else dict(controller.see(controller.design[0]).outputs)
     names = (*controller.signals, *controller.further)
     read = {name: outputs.get(name, command.reference_unit) for name in names}
+    if controller.outer is not None:
+        read.setdefault(controller.outer.position, controller.outer.place_unit)
     return {REFERENCE: command.reference_unit, command.input: command.unit, **read}
 
 
@@ -146,6 +167,25 @@ def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[st
     title = f"Acceptance: {session.problem.title}"
     write_acceptance_page(result, session.folder / PAGE, title=title, files=files, command=command)
     return content
+
+
+def write_again(result: Acceptance, session: Session) -> list[Path]:
+    """Write the logs that are of the law as a fit takes them, and the tables of their experiments."""
+    problem, folder, files, text = session.problem, session.folder / AGAIN, list[Path](), TABLES
+    plant = problem.design_plant
+    name = next(name for name, each in problem.plants.items() if each is plant)
+    for number, log in enumerate(result.experiments, start=1):
+        stem = re.sub(r"\W+", "_", Path(log.source).stem) or "log"
+        label = f"{stem}_under_law" if len(result.experiments) == 1 else f"{stem}_under_law_{number}"
+        files.append(write_log(log, folder / f"{label}.csv"))
+        headers = {head.partition(" ")[0]: head for head in log.to_polars().columns}
+        inputs, outputs = (
+            ", ".join(f'{each} = "{headers[each]}"' for each in names if each in headers)
+            for names in (plant.inputs, plant.outputs)
+        )
+        path = os.path.relpath(files[-1], problem.folder).replace(os.sep, "/")
+        text += TABLE.format(name=label, plant=name, log=path, inputs=inputs, outputs=outputs)
+    return [*files, write_text(folder / "experiments.toml", text)] if files else []
 
 
 def plan_bring_up(

@@ -35,6 +35,10 @@ FEWER_TICKS = (
     "a machine with dry friction is compared with its model by simulation under the reference of every tick, which a "
     "log of every n-th has not"
 )
+OUTER_LOOP = (
+    "an outer loop was closed around the law, so that the link and what touches it are in the response; for the law's "
+    "own leave it out, with the link as in the design plant, and give the law the reference of the bring-up itself"
+)
 OTHER_LAW = "the logs are not of this law; mend that first, then record again"
 UNTOLD_LAW = "the logs do not tell whether they are of this law"
 ACCEPTANCE_SCHEMA = "seaopt/acceptance/1"
@@ -70,6 +74,7 @@ class Acceptance(Result, Worded):
     differences: Differences | None = None
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
     place: tuple[str, float, str] | None = None
+    experiments: tuple[Log, ...] = ()
 
     @property
     def replayed(self) -> bool:
@@ -149,6 +154,9 @@ def accept(
     of the log's rate, and whose period is a whole number of rows. It is of this law where it excludes those with a gain
     of half its size, with a reference, reading or command that is halved, or with a tick more delay; else undecided.
 
+    A law with an outer loop is replayed with it where the reference is the link's place, in m or rad, and the link's
+    position is in the log; no response follows. A reference in N or N m is the one that the force law was given.
+
     A schedule is replayed as its variable moves; its response is judged where that stands still, against the figures
     that the law has there. Predictive control is replayed with its limits; its response is that of the law while none
     is active.
@@ -193,7 +201,12 @@ def accept(
     if isinstance(controller, ScheduledController) and rows[0].middle is not None:
         place = controller.over, rows[0].middle, controller.unit
     sources = tuple(log.source for log in logs)
-    result = Acceptance(controller=law, sources=sources, replays=replays, place=place)
+    experiments = tuple(
+        make_experiment(law, ticks, row.command_late)
+        for ticks, row in zip(rows, replays, strict=True)
+        if row.met and row.ticks_per_row == 1 and ticks.rendered is None  # behind an outer loop is another plant
+    )
+    result = Acceptance(controller=law, sources=sources, replays=replays, place=place, experiments=experiments)
     if not result.replayed:
         told = any(not row.met and not row.undecided for row in replays)
         return replace(result, left_out={"response": OTHER_LAW if told else UNTOLD_LAW})
@@ -204,6 +217,8 @@ def accept(
     blocks, left_out = list[Blocks](), dict[str, str]()
     for ticks, row in zip(rows, replays, strict=True):
         try:
+            if ticks.rendered is not None:
+                raise LogError(OUTER_LOOP)
             cut = cut_periods(law, ticks if place is None else require_still(controller, ticks))
             blocks.append(shift_command(law, cut, row.command_late) if row.ticks_per_row > 1 else cut)
         except LogError as error:
@@ -276,6 +291,22 @@ def require_still(source: Source, ticks: Ticks) -> Ticks:
             "response is judged where it stands; hold it at a value"
         )
     return ticks
+
+
+def make_experiment(controller: Controller, ticks: Ticks, late: int) -> Log:
+    """Return a log whose rows have the command that is in force there. `late`: rows by which it is logged late."""
+    moved = ticks.move_command(late - controller.spec.loop_delay_samples)
+    names, command = (*controller.signals, *controller.further), controller.command
+    table = np.column_stack([moved.measured, moved.further])
+    columns = {name: table[:, i] for i, name in enumerate(names)} | {command.input: moved.command}
+    outputs = {} if controller.design is None else controller.see(controller.design[0]).outputs
+    units = {name: outputs.get(name, "") for name in names} | {command.input: command.unit}
+    return Log.from_arrays(
+        time=np.arange(len(moved)) / ticks.rate_hz,
+        units={name: unit or "-" for name, unit in units.items()},
+        source=ticks.source,
+        **columns,
+    )
 
 
 def list_draws(

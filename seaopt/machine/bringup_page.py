@@ -38,6 +38,13 @@ def judge(result: BringUp, commands: Commands) -> Verdict | None:
     return Verdict(met=result.met, text=text, reasons=reasons)
 
 
+OUTER = (
+    "These stages are of the force law alone: leave the outer loop out, with the link as in the design plant, and give "
+    "the law the reference itself. Close the outer loop after the last stage, and log its x_0 as the reference, with "
+    "the link's position: seaopt accept replays both."
+)
+
+
 def summarise(result: BringUp) -> list[KeyFigure]:
     """Return the bandwidth of each stage."""
     return [
@@ -52,11 +59,12 @@ def describe(result: BringUp) -> list[Section]:
     """Return a table of the stages, then each with what to play, to log, to expect, and when to stop."""
     rows = tuple(_list_row(stage) for stage in result.stages)
     head = ("stage", "law", "bandwidth (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
+    outer = (OUTER,) if result.stages[-1].controller.renders else ()
     overview = Section(
         title="Stages",
         part="stages",
         tables=(Table(head=head, rows=rows, align="<<>>>>>"),),
-        remarks=(*(f"Stop a stage when {text}" for text in ALWAYS), NEXT),
+        remarks=(*(f"Stop a stage when {text}" for text in ALWAYS), NEXT, *outer),
     )
     return [overview, *(_describe_stage(stage) for stage in result.stages)]
 

@@ -266,6 +266,8 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Mapping[str, Contr
     controller, ticks, law = setting.controller, setting.ticks, setting.law
     if setting.linear.compensation is not None:
         return LineMatch(causes=(leave_open("terms", "law"),))
+    if ticks.rendered is not None:
+        return LineMatch(causes=(leave_open("outer", "loop"),))
     if isinstance(law, RunnableSchedule):
         moved = 0.0 if ticks.place is None else float(np.ptp(ticks.place))
         if moved > SAME_PLACE * np.ptp(law.table.points):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control import Controller
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import LogError
 from seaopt.formatting import join_words
 from seaopt.logs import Log
@@ -18,6 +19,7 @@ from seaopt.records import record
 from seaopt.signals import REFERENCES
 
 AT_LIMIT = 1.0 - 1e-6  # of the command's limit, from which on it is there
+FORGETS = 35.0  # time constants in which nothing is left of a start
 FEWEST = 50  # ticks that a replay takes at least
 
 
@@ -32,6 +34,9 @@ class Ticks:
     further: Float[np.ndarray, "n r"]  # what its terms and its gate read besides
     command: Float[np.ndarray, " n"]
     place: Float[np.ndarray, " n"] | None = None  # of a schedule, its variable
+    rendered: Float[np.ndarray, "n 2"] | None = (
+        None  # stiffness and damping of an outer loop, of which reference is the sum
+    )
     left_out: int = 0  # rows of the log that are in no such stretch
 
     def __len__(self) -> int:
@@ -46,6 +51,7 @@ class Ticks:
             measured=self.measured[read],
             further=self.further[read],
             place=None if self.place is None else self.place[read],
+            rendered=None if self.rendered is None else self.rendered[rows],
             command=self.command[rows if command is None else command],
         )
 
@@ -85,6 +91,11 @@ def take_ticks(
     """
     command, names = controller.command, (*controller.signals, *controller.further)
     called = [reference] if reference is not None else [name for name in REFERENCES if name in log.signals]
+    around = controller.outer if controller.renders else None
+    if around is not None and called and called[0] in log.signals and log.signal(called[0]).unit != around.place_unit:
+        around = None  # the force law's own reference, whatever it comes from
+    if around is not None:
+        names = tuple(dict.fromkeys((*names, around.position)))
     if not called or called[0] not in log.signals:
         raise LogError(
             f"{log.source}: has no channel {reference or ' or '.join(REFERENCES)}; log what the law was given as its "
@@ -113,16 +124,28 @@ def take_ticks(
         )
     table, count = table[rows], len(controller.signals)
     place = table[:, -1] if placed else None if over is None else np.full(len(table), at)
-    return Ticks(
+    further = 2 + count + len(controller.further)
+    ticks = Ticks(
         source=log.source,
         rate_hz=log.rate_hz,
         reference=table[:, 0],
         command=table[:, 1],
         measured=table[:, 2 : 2 + count],
-        further=table[:, 2 + count : 2 + len(names)],
+        further=table[:, 2 + count : further],
         place=place,
         left_out=len(log) - len(table),
     )
+    return ticks if around is None else _render(ticks, around, table[:, 2 + names.index(around.position)])
+
+
+def _render(ticks: Ticks, outer: OuterLoop, position: Float[np.ndarray, " n"]) -> Ticks:
+    """Return ticks whose reference is what an outer loop makes of the link's place and position, but for the first, in
+    which its filter forgets what was before the log.
+    """
+    stiff, lax = replace(outer, damping=0.0), replace(outer, stiffness=0.0)
+    parts = np.column_stack([each.run(ticks.reference, position) for each in (stiff, lax)])
+    first = min(math.ceil(FORGETS / -math.log(outer.pole)) if outer.pole else 1, len(ticks) - FEWEST)
+    return replace(ticks, reference=np.sum(parts, axis=1), rendered=parts).take(slice(max(first, 1), None))
 
 
 def _find_longest(log: Log, whole: Any) -> slice:

@@ -32,6 +32,8 @@ def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], refere
     columns = {**columns, **table.columns} | ({} if table.reference is None else {REFERENCE: table.reference})
     columns = columns if reference is None else {**columns, REFERENCE: reference}
     stated = {name: make_column(column, problem.folder) for name, column in columns.items() if name in units}
+    optional = stated.keys() - table.columns.keys() - {REFERENCE}  # of another log, which may have more
+    stated = {name: column for name, column in stated.items() if name not in optional or _has(column, fields)}
     channels: dict[str, Column] = {}
     for name, unit in units.items():
         column = _choose_column(name, stated.get(name), fields)
@@ -58,9 +60,13 @@ def _find_template(problem: Problem) -> ExperimentTable | None:
     return next((each for each in of_plant if each.virtual is None), None)
 
 
+def _has(column: Column, fields: Mapping[str, Field]) -> bool:
+    return not isinstance(column.column, str) or column.column in fields
+
+
 def _choose_column(name: str, stated: Column | None, fields: Mapping[str, Field]) -> Column | None:
     """Return the column that is stated, where the log has it, else one of the channel's name."""
-    if stated is not None and (not isinstance(stated.column, str) or stated.column in fields):
+    if stated is not None and _has(stated, fields):
         return stated
     called = REFERENCES if name == REFERENCE else (name,)
     header = next((field for field in fields if field in called or bare_name(field) in called), None)

@@ -72,6 +72,20 @@ def test_a_log_of_this_law_is_accepted(folder, accept):
     assert "Replay" in (folder / "out" / "acceptance.html").read_text()
 
 
+def test_an_accepted_log_is_an_experiment_of_a_fit(folder, accept):
+    done = accept(folder / "good.csv", "--reference", "reference")
+    assert "experiments.toml" in done.output
+    tables = (folder / "out" / "again" / "experiments.toml").read_text()
+    free = "parameters = { J = { value = 2.5e-6, free = true }, eta = { value = 0.9, free = true }, I_p"
+    text = PROBLEM.replace("parameters = { I_p", free, 1) + '[fit]\nmethod = "prediction_error"\n' + tables
+    (folder / "again.toml").write_text(text)
+    problem = so.read_problem(folder / "again.toml")
+    (experiment,) = problem.experiments()
+    log, raw = experiment.log, so.read_log(folder / "good.csv")
+    assert experiment.delay_s == 0.0  # the program's sample of delay is in the rows
+    assert np.array_equal(log["I"], raw["I"][:-1]) and np.array_equal(log["F1"], raw["F1"][1:])
+
+
 def test_a_log_of_the_target_is_taken_as_it_is(folder, accept):
     good = accept(folder / "good.sealog")
     assert good.exit_code == 0

@@ -1,0 +1,91 @@
+"""Acceptance of a law with an outer loop around it, on equations of motion and an outer loop of the test's own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import seaopt as so
+from seaopt.control import Impedance, add_impedance
+
+T = 1e-3
+KNEE = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "k_s": 300.0}
+INERTIA, DAMPER = 0.5, 2.0  # of the link
+
+
+@pytest.fixture(scope="module")
+def impedance():
+    """Return a knee's law that renders a stiffness at its link."""
+    knee = so.plants.rotary()
+    values = knee.complete(so.ParameterSet()).update(**KNEE)
+    spec = so.ControllerSpec(bandwidth_hz=20, measured="tau_s", current_limit_A=9.0, max_noise_gain=45)
+    law = so.tune(so.plants.rotary(link="locked"), values, spec)
+    return add_impedance(
+        law, knee, values, Impedance(stiffness=20.0, damping=1.0, velocity_filter_s=0.005), name="knee"
+    )
+
+
+def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1):
+    """Return x_0, the force reference, the torque, the link's angle, and the command, a row per tick."""
+    rng, outer = np.random.default_rng(seed), law.outer
+    mass, kick = KNEE["N"] ** 2 * KNEE["J_m"], KNEE["N"] * KNEE["eta"] * KNEE["K_tau"]
+    a = np.zeros((5, 5))  # motor's angle at the output, its speed, the link's, its speed, current
+    a[0, 1] = a[2, 3] = 1.0
+    a[1, [0, 2]], a[1, 1] = np.array([-1.0, 1.0]) * KNEE["k_s"] / mass, -(KNEE["N"] ** 2) * KNEE["b_r"] / mass
+    a[1, 4], a[3, [0, 2]] = kick / mass, np.array([1.0, -1.0]) * KNEE["k_s"] / INERTIA
+    a[3, 3] = -DAMPER / INERTIA
+    moved = scipy.linalg.expm(a * T)
+    x, state, speed, before, waiting = np.zeros(5), np.zeros(law.law.c.size), 0.0, 0.0, 0.0
+    rows = np.empty((goal.size, 5))
+    places = [0.0] * (late + 1)
+    for k in range(goal.size):
+        angle = x[2] + 1e-5 * rng.normal()
+        torque = KNEE["k_s"] * (x[0] - x[2]) + 0.02 * rng.normal()
+        places.append(angle)
+        seen = places[-1 - late]
+        speed = (0.005 * speed + seen - before) / (0.005 + T)
+        before = seen
+        asked = outer.direction * (stiffness * (goal[k] - seen) - damping * speed)
+        effort = law.law.c @ state + law.law.d @ np.array([asked, torque])
+        state = law.law.a @ state + law.law.b @ np.array([asked, torque])
+        current = effort * law.per_effort
+        rows[k] = goal[k], asked, torque, angle, current
+        x[4], waiting = waiting, current
+        x = moved @ x
+    return rows
+
+
+def make_log(rows, *, inner=False, position=True):
+    columns = {"reference": rows[:, 1 if inner else 0], "tau_s": rows[:, 2], "I": rows[:, 4]}
+    units = {"reference": "N m" if inner else "rad", "tau_s": "N m", "I": "A"}
+    if position:
+        columns, units = columns | {"theta_l": rows[:, 3]}, units | {"theta_l": "rad"}
+    return so.Log.from_arrays(time=T * np.arange(len(rows)), units=units, source="knee", **columns)
+
+
+GOAL = 0.1 * np.sin(2.0 * np.pi * np.arange(4000) * T) + 0.05 * (np.arange(4000) // 1000 % 2)
+
+
+@pytest.mark.parametrize("first", [0, 777])
+def test_the_outer_loop_is_replayed_with_the_law(impedance, first):
+    rows = run(impedance, GOAL)[first:]
+    result = so.accept(impedance, [make_log(rows)])
+    (row,) = result.replays
+    assert row.met and row.mismatch < 1e-3 * row.rms, row
+    assert result.response is None and "leave it out" in result.left_out["knee"]
+    assert so.accept(impedance, [make_log(rows, inner=True, position=False)]).replayed
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "value"), [({"stiffness": 10.0}, "stiffness", 0.5), ({"damping": 0.5}, "damping", 0.5)]
+)
+def test_another_outer_loop_is_named(impedance, changes, what, value):
+    (row,) = so.accept(impedance, [make_log(run(impedance, GOAL, **changes))]).replays
+    cause = row.causes[0]
+    assert not row.met and cause.explains and cause.what == what and np.isclose(cause.value, value, rtol=1e-3), row
+
+
+def test_without_the_links_position_it_says_what_to_log(impedance):
+    with pytest.raises(so.SeaoptError, match="log in each tick tau_s and theta_l"):
+        so.accept(impedance, [make_log(run(impedance, GOAL[:500]), position=False)])
