@@ -203,8 +203,8 @@ def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
         console.wrap(f"note: {note}")
     out = shlex.quote(str(target.with_suffix("")))
     console.say(f"next: seaopt run {shlex.quote(str(target))} -o {out}", soft_wrap=True)
-    if len({column.log for column in proposal.columns}) == 1:
+    if proposal.single:
         console.wrap(
-            "then: record the test once more at half the amplitude, and uncomment that log in the file; one log alone "
-            "hides what the model lacks"
+            "then: record the test once more at half the amplitude, and uncomment that log in the file; one amplitude "
+            "alone hides what the model lacks"
         )

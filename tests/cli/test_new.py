@@ -97,7 +97,8 @@ def test_as_many_guesses_are_printed_as_the_file_names(folder, seaopt, held):
 
 def test_several_logs_are_several_experiments(folder, seaopt, held):
     (folder / "second run.csv").write_bytes(held.read_bytes())
-    assert seaopt("new", "knee.csv", "second run.csv", "--yes").returncode == 0
+    out = seaopt("new", "knee.csv", "second run.csv", "--yes")
+    assert out.returncode == 0 and "once more at half the amplitude" in out.stdout  # both have one
     problem = so.read_problem(folder / "problem.toml")
     assert [experiment.name for experiment in problem.table.experiment] == ["knee", "second_run"]
     assert len(problem.experiments()) == 2

@@ -355,21 +355,21 @@ def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
 
 
 def _find_implausible(fit: Fit) -> Iterator[FitFinding]:
-    """Yield free parameters of built-in plants that lie outside what such actuators have."""
-    plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
-    for name in fit.covariance.names:
-        declared = next((plant.parameters[name] for plant in plants if name in plant.parameters), None)
-        if not isinstance(declared, Parameter) or declared.plausible is None:
+    """Yield parameters of built-in plants that lie outside what such actuators have: free ones, and fixed ones."""
+    declared = {name: each for e in fit.experiments for name, each in e.plant.parameters.items()}
+    for name, each in declared.items():
+        if not isinstance(each, Parameter) or each.plausible is None or name not in fit.parameters:
             continue
-        (low, high), parameter = declared.plausible, fit.parameters[name]
+        (low, high), parameter = each.plausible, fit.parameters[name]
         value = parameter.value
-        if low <= value <= high or not parameter.identified:
+        if low <= value <= high or not (parameter.identified or not parameter.free) or value == each.value:
             continue
+        check = "the units of inputs and outputs, such as mA read as A, and the fixed parameters"
         text = (
             f"{name} = {value:.4g}{unit_after(parameter.unit)}; actuators of this kind have {low:g} to {high:g}: check "
-            "the units of inputs and outputs, such as mA read as A, and the fixed parameters"
+            f"{check if parameter.free else 'this fixed value and its unit'}"
         )
-        yield _warn("range", name, text, bad=value > BEYOND * high or value * BEYOND < low)
+        yield _warn("range", name, text, bad=parameter.free and (value > BEYOND * high or value * BEYOND < low))
 
 
 def _find_contradicting_delays(fit: Fit) -> Iterator[FitFinding]:

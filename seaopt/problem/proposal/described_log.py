@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.estimation.judgement.second_log import SECOND
 from seaopt.logs.quality.clock import ClockQuality
 from seaopt.problem.proposal.roles import Assignment
 from seaopt.problem.proposal.survey import LogSurvey
@@ -62,6 +63,16 @@ def make_table(log: DescribedLog, outputs: Sequence[str]) -> Table | None:
     signals = log.signals
     channels = {name: Signal(name=name, values=signals[name].copy(), unit="") for name in (log.roles.input, *outputs)}
     return Table(time=time, signals=channels, source=log.survey.name)
+
+
+def list_single(logs: Sequence[DescribedLog]) -> list[DescribedLog]:
+    """Return the last log of each plant whose inputs have one amplitude: what a model lacks, one amplitude hides."""
+    swings: dict[str, list[float]] = {}
+    for log in logs:
+        size = log.roles.columns[log.roles.input].swing * abs(log.si_scale(log.roles.input))
+        swings.setdefault(log.plant, []).append(size)
+    lasts = {log.plant: log for log in logs}
+    return [lasts[plant] for plant, sizes in swings.items() if min(sizes) > SECOND * max(sizes)]
 
 
 def doubt_clock(survey: LogSurvey) -> str:

@@ -13,7 +13,7 @@ from seaopt.formatting import format_toml, printable
 from seaopt.logs import assess_quality
 from seaopt.logs.quality.clock import JITTER_LIMIT
 from seaopt.problem.proposal.actuators import DESIGN, ParameterLine, Proposed, screw_travel
-from seaopt.problem.proposal.described_log import GEARED, SI_UNITS, DescribedLog, doubt_clock, make_table
+from seaopt.problem.proposal.described_log import GEARED, SI_UNITS, DescribedLog, doubt_clock, list_single, make_table
 from seaopt.problem.proposal.questions import Interview
 from seaopt.problem.proposal.roles import DESCRIPTIONS, FOLLOWS
 from seaopt.problem.proposal.sensor_noise import combine_noise, limit_noise_gain, list_sensors
@@ -55,7 +55,7 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
             parts = options.get("parts", [])
             assert isinstance(parts, list)
             lines += [f"# parts = {format_toml([*parts, 'stribeck'])}", "# sticks = true  # friction jumps at rest"]
-    names: set[str] = set()
+    names, single = set[str](), list_single(logs)
     for log in logs:
         name = next(name for name in _number_names(log.name) if name not in names)
         names.add(name)
@@ -64,7 +64,7 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
             keys.append('# use = "validate"  # keeps this log out of the fit, which is then scored on it')
         head_rows, channels = _describe_experiment(log, name, interview), _describe_channels(log, actuator, interview)
         lines += ["", *_write_experiment(head_rows, keys, channels)]
-        if len(logs) == 1:
+        if any(log is each for each in single):
             lines += _offer_second_log(log, name, head_rows, channels)
     lines += _describe_fit(logs)
     if actuator.measured:
@@ -107,8 +107,8 @@ def _offer_second_log(
     return [
         "",
         "# Record the same test once more at half the amplitude, and uncomment these lines. Where the model lacks",
-        "# friction, play or a motor that saturates, its parameters fit one amplitude and miss the other: a single",
-        "# log hides that.",
+        "# friction, play or a motor that saturates, its parameters fit one amplitude and miss the other, and one",
+        "# amplitude alone hides that.",
         *(f"# {line}" for line in _write_experiment([(text, "") for text in texts.values()], keys, bare)),
     ]
 

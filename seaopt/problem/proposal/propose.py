@@ -28,7 +28,7 @@ from seaopt.formatting import format_count, join_words
 from seaopt.logs.quality.clock import assess_clock
 from seaopt.logs.reading.vocabulary import COUNTS, UNITS_OF, is_m_open, read_header
 from seaopt.problem.proposal.actuators import Facts, propose_linear, propose_rotary
-from seaopt.problem.proposal.described_log import GEARED, DescribedLog, doubt_clock, make_table
+from seaopt.problem.proposal.described_log import GEARED, DescribedLog, doubt_clock, list_single, make_table
 from seaopt.problem.proposal.problem_text import write_problem_text
 from seaopt.problem.proposal.questions import Interview, Question, name_entry
 from seaopt.problem.proposal.roles import (
@@ -80,7 +80,7 @@ class Proposal:
     """A problem file's text, the roles of the columns, all questions, and the guesses for those without an answer.
 
     `guessed` are the guesses that results rest on, as the file's key of that name has them; `notes` are remarks on what
-    the logs show.
+    the logs show; `single`: whether a plant's logs have one amplitude, so that the file asks for another.
     """
 
     text: str
@@ -89,6 +89,7 @@ class Proposal:
     guesses: tuple[Question, ...]
     guessed: tuple[str, ...]
     notes: tuple[str, ...]
+    single: bool
 
     @property
     def open(self) -> tuple[Question, ...]:
@@ -150,6 +151,7 @@ def propose(
             *(note for log in described for note in _list_notes(log)),
             *(f"{name_entry(key)}: {doubt}; check its unit" for key, doubt in interview.list_doubts().items()),
         ),
+        single=bool(list_single(described)),
     )
 
 

@@ -151,6 +151,11 @@ def test_few_samples_bounds_and_implausible_values_are_errors():
     assert {"bound"} <= kinds(bounded) and not bounded.met
     scaled = fit(columns | {"I": 1e3 * columns["I"]}, free=("J", "b_r", "eta"))
     assert scaled.status == "converged" and kinds(scaled) == {"range"} and not scaled.met
+    long = params.update(l=200.0, N_p=3e5)  # a lead in mm, and a gear that makes up for it
+    questioned = so.fit([so.Experiment(plant=so.plants.high_impedance(), log=log, outputs=("F1", "F2"))], long)
+    assert questioned.met
+    (finding,) = (finding for finding in questioned.findings if finding.kind == "range" and finding.where == "l")
+    assert finding.severity == "warning" and "this fixed value and its unit" in finding.text
 
 
 def test_the_coherence_of_a_residual_that_follows_nothing_is_chance():
