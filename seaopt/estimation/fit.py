@@ -137,7 +137,9 @@ def fit(
     callback = _count_iterations(searching)
     before = count_evaluations()
     with keep_passes():
-        solved = search_delays(chosen.solve(hold_bristles(problem), callback), chosen.max_iterations, callback)
+        solved = search_delays(
+            chosen.solve(hold_bristles(problem, problem.unknowns.start), callback), chosen.max_iterations, callback
+        )
         evaluations = count_evaluations() - before
         result = summarise(solved, chosen, diagnostics, started)
         if diagnostics:

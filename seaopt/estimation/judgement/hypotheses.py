@@ -86,6 +86,12 @@ def _slip_in_spring(s: Sizes) -> Starts:
     return [{"k_h": part * s.stiffness, "y_h": share * s.deflection, "n_h": n} for part, share, n in shares]
 
 
+def _bend_before_slipping(s: Sizes) -> Starts:
+    """Return bristles that give way at a fiftieth of the travel, and at far less: of a light joint that resonates."""
+    bends = (50.0, 400.0) if s.friction and s.travel else ()
+    return [{"sigma_0": part * s.friction / s.travel, "sigma_1": 0.0} for part in bends]
+
+
 # In the order in which they are tried, those that are the quickest to refit first.
 HYPOTHESES = (
     Hypothesis(
@@ -139,7 +145,7 @@ HYPOTHESES = (
     Hypothesis(
         effect="the joint gives way before it slips",
         part="lugre",
-        starts=lambda s: [{"sigma_0": 50.0 * s.friction / s.travel, "sigma_1": 0.0}] if s.friction and s.travel else [],
+        starts=_bend_before_slipping,
     ),
     Hypothesis(effect="the motor cogs", part="cogging", starts=lambda s: [s.ripple] if s.ripple else []),
     Hypothesis(effect="the supply sags", part="supply_sag", starts=_zero("R_b")),

@@ -29,7 +29,7 @@ from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_sticking
 from seaopt.estimation.solver.least_squares import FIRST_RADIUS, find_blocked, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
-from seaopt.estimation.solver.step_size import choose_first_steps
+from seaopt.estimation.solver.step_size import choose_first_steps, hold_bristles, refine_bristles
 from seaopt.parameters import ParameterSet
 from seaopt.progress import Progress, ignore
 from seaopt.records import record
@@ -223,7 +223,7 @@ def _refit(
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
     for name in ("sigma", "substeps"):
         problem = problem.with_values(name, {e.name: getattr(e, name) for e in old.experiments})
-    start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
+    problem, start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
     if not np.isfinite(start.cost):
         return None
     problem = _rest(problem, start, old)
@@ -237,8 +237,13 @@ def _refit(
             checked = powers
         low, high, first = unknowns.low, unknowns.high, evaluation
         near = NEAR if np.any(powers < HALF * at_fit) else max(NEAR, SLIGHT * helps * first.cost)
-        solution = minimise(problem, first, low, high, decrement=near, max_iterations=ROUND, first_radius=radius)
+        points = [first]
+        solution = minimise(
+            problem, first, low, high, decrement=near, max_iterations=ROUND, first_radius=radius, callback=points.append
+        )
         evaluation = solution.evaluation
+        if points[-2:] == [evaluation] * 2:  # no better: stiffer bristles may ask for shorter steps
+            problem = refine_bristles(problem, evaluation.z)
         if evaluation is first and solution.status == "max_iterations" and radius == FIRST_RADIUS:
             radius = CLOSE  # every step went too far
             continue
@@ -277,11 +282,11 @@ def _settle(refit: Refit, start: Evaluation) -> Refit:
     return replace(refit, evaluation=evaluation, excess=excess, gain=gain)
 
 
-def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float]) -> Evaluation:
-    """Return the evaluation at the fit's values and the best start of what is added: that from which a step of all else
-    is to gain the most, for what a fit has in place of an effect is at odds with most of it.
+def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float]) -> tuple[FitProblem, Evaluation]:
+    """Return the evaluation at the fit's values and the best start of what is added, with steps that hold there: that
+    from which a step of all else is to gain the most, for what a fit has in place of an effect is at odds with most.
     """
-    unknowns, evaluations = problem.unknowns, list[Evaluation]()
+    unknowns, starts = problem.unknowns, list[tuple[FitProblem, Evaluation]]()
     delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
     hypothesis, springs = change.hypotheses[-1], {e.plant.spring for e in change.experiments}
     stiffnesses = [unknowns.names.index(s.stiffness) for s in springs if s and s.stiffness in unknowns.names]
@@ -289,16 +294,22 @@ def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float])
         z = unknowns.start_from({**fitted, **start})
         z[delays] -= hypothesis.lag(start)
         z[stiffnesses] -= hypothesis.stiffens(change.sizes, start)
-        evaluations.append(problem.evaluate(np.clip(z, unknowns.low, unknowns.high)))
+        z = np.clip(z, unknowns.low, unknowns.high)
+        evaluation, stable = problem.evaluate(z), problem
+        if not np.isfinite(evaluation.cost):
+            stable = hold_bristles(problem, z)
+            evaluation = stable.evaluate(z) if stable is not problem else evaluation
+        starts.append((stable, evaluation))
     others = np.array([name in fitted for name in unknowns.names])
 
-    def reach(evaluation: Evaluation) -> float:
+    def reach(start: tuple[FitProblem, Evaluation]) -> float:
+        _, evaluation = start
         if not np.isfinite(evaluation.cost):
             return np.inf
         free = others & ~find_blocked(evaluation, unknowns.low, unknowns.high)
         return evaluation.cost - 0.5 * evaluation.distance_squared(free)
 
-    return min(evaluations, key=reach)
+    return min(starts, key=reach)
 
 
 def _rest(problem: FitProblem, start: Evaluation, old: FitProblem) -> FitProblem:

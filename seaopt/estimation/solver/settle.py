@@ -21,6 +21,7 @@ from seaopt.estimation.solver.step_size import (
     find_worst,
     refine_steps,
 )
+from seaopt.plants.friction import remembers
 from seaopt.records import record
 
 MAX_ROUNDS = 12  # of estimating sigma and choosing the step
@@ -207,8 +208,10 @@ def _tell_round(callback: Callback | None, problem: FitProblem, number: int) -> 
 
 
 def measure_flatness(problem: FitProblem) -> float:
-    """Return the share of the cost that is no change: nothing where no joint sticks, and the cost is smooth."""
-    return FLAT if any(experiment.model.sticks for experiment in problem.experiments) else 0.0
+    """Return the share of the cost that is no change: nothing where no joint sticks, or bends before it slips, and the
+    cost is smooth.
+    """
+    return FLAT if any(e.model.sticks or remembers(e.data.plant) for e in problem.experiments) else 0.0
 
 
 def coarsen(problem: FitProblem, z: Vector) -> tuple[FitProblem, Evaluation]:

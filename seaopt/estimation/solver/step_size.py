@@ -88,26 +88,31 @@ def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most:
     return min(_choose_steps(experiment.count_steps(z), StepError(output=error), allowed, experiment), most)
 
 
-def hold_bristles(problem: FitProblem) -> FitProblem:
-    """Return the problem with steps short enough for bristles at the start, which are stiff where they slip. How fast
-    they slip only a simulation tells: with steps too long for it that overflows, or makes a cost that half as long ones
-    change.
+def hold_bristles(problem: FitProblem, z: Vector) -> FitProblem:
+    """Return the problem with steps short enough for bristles at z, which are stiff where they slip. How fast they slip
+    only a simulation tells: with steps too long for it that overflows, or makes a cost that half as long ones change.
     """
     if not any(remembers(experiment.data.plant) for experiment in problem.experiments):
         return problem
-    z, cost = problem.unknowns.start, np.nan
+    cost = np.nan
     while True:
         new_cost = problem.evaluate(z).cost
         if np.isfinite(new_cost) and abs(new_cost - cost) <= SAME_COST * new_cost:
             return problem
-        steps = [experiment.count_steps(z) for experiment in problem.experiments]
-        finer = [
-            min(2 * count, MAX_SUBSTEPS) if remembers(experiment.data.plant) else count
-            for experiment, count in zip(problem.experiments, steps, strict=True)
-        ]
-        if finer == steps:
+        finer = refine_bristles(problem, z)
+        if finer is problem:
             return problem
-        problem, cost = _with_substeps(problem, finer), new_cost
+        problem, cost = finer, new_cost
+
+
+def refine_bristles(problem: FitProblem, z: Vector) -> FitProblem:
+    """Return the problem with steps half as long where there are bristles, if that is still allowed."""
+    steps = [experiment.count_steps(z) for experiment in problem.experiments]
+    finer = [
+        min(2 * count, MAX_SUBSTEPS) if remembers(experiment.data.plant) else count
+        for experiment, count in zip(problem.experiments, steps, strict=True)
+    ]
+    return problem if finer == steps else _with_substeps(problem, finer)
 
 
 def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:

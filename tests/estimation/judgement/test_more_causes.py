@@ -20,7 +20,9 @@ SERVO = {"k_p": 0.25, "k_d": 0.006, "g_s": 1.0}  # A per rad of the motor, and p
 STEPS = 4
 
 
-def record(*, cog=(0.0, 0.0, 0.0), slip=(0.0, 1.0), bristle=0.0, sag=None, late=None, seconds=6.0, rest_s=0.0):
+def record(
+    *, cog=(0.0, 0.0, 0.0), slip=(0.0, 1.0), bristle=0.0, sag=None, late=None, seconds=6.0, rest_s=0.0, steps=STEPS
+):
     """Return a log. `cog`: sine, cosine and wave number; `slip`: stiffness and limit of a spring that slips; `bristle`:
     stiffness of what the joint bends by; `sag`: the supply's resistance, the input then being a duty; `late`: samples
     of the firmware's own between which its command stands still, the input then being a goal; `rest_s`: in front.
@@ -54,7 +56,7 @@ def record(*, cog=(0.0, 0.0, 0.0), slip=(0.0, 1.0), bristle=0.0, sag=None, late=
         return speed, push / p["J_m"], moves, bent
 
     if late is None:
-        angle, _, z, _ = integrate(rates, 4, inputs, 1.0 / RATE_HZ, STEPS)
+        angle, _, z, _ = integrate(rates, 4, inputs, 1.0 / RATE_HZ, steps)
     else:
         angle, _, z = _serve(rates, inputs, held, late)
     noise = np.random.default_rng(2)
@@ -128,6 +130,11 @@ def test_a_spring_that_hardly_slips_is_as_stiff_as_without_what_slips():
 @pytest.mark.slow
 def test_a_joint_that_gives_way_before_it_slips_is_named():
     check(fit(record(bristle=0.1)), "lugre", sigma_0=0.1)
+
+
+def test_bristles_far_stiffer_than_a_travel_tells_are_found():
+    """They are stiff where they slip: a refit takes shorter steps as it finds them stiffer."""
+    check(fit(record(bristle=1.0, steps=40)), "lugre", sigma_0=1.0)
 
 
 @pytest.mark.slow
