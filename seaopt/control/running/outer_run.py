@@ -36,9 +36,11 @@ def enclose_law(law: Law, outer: OuterLoop, place: int | None = None) -> Law:
 
 
 def enclose(controller: Controller, plant: Plant) -> tuple[Law, tuple[str, ...]]:
-    """Return the law of a controller, with its outer loop on a plant whose link moves, and the outputs it reads."""
+    """Return the law of a controller, with its outer loop on a plant whose link moves, and the outputs it reads. One
+    without stiffness is left out, as in the law that runs: it leaves the link where it is.
+    """
     signals, outer = controller.signals, controller.outer
-    if outer is None or outer.position not in plant.outputs:
+    if outer is None or not controller.renders or outer.position not in plant.outputs:
         return controller.law, signals
     if outer.position in signals:
         return enclose_law(controller.law, outer, signals.index(outer.position)), signals

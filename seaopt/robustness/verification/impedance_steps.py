@@ -8,6 +8,7 @@ rest. Friction may hold it short of where it should end, so that only rest is re
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,16 +16,14 @@ from seaopt.codec import OrInfinite, OrNaN
 from seaopt.control import Controller
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
-from seaopt.control.laws.realisation import runnable
-from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, find_dry_friction
 from seaopt.plants.plant import output_function
 from seaopt.records import record
 from seaopt.robustness.verification.oscillation import Signal
-from seaopt.robustness.verification.scenarios import NOMINAL_EFFORT
+from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.scenarios import NOMINAL_EFFORT, Phase, Scenario
 
 SHARES = (0.05, 0.5)  # of the effort that the current limit holds at rest
 FRICTION_SHARES = (0.5, 5.0)  # times the dry friction, where there is no limit
@@ -70,16 +69,7 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
         return ()
     motion, completed = str(plant.port.motion), plant.complete(params)
     # A gate that gives its sensor up lets the link hang, which would pass for rest.
-    law = runnable(controller, gate=False, outer=True)
-    params = controller.delay(params)
-    loop = SampledLoop(
-        plant=plant,
-        law=law,
-        measured=controller.signals,
-        delay_samples=controller.compute_delay_samples,
-        longest_delay_s=find_longest_delay(plant, [params]),
-        sticks=can_stick(plant),
-    )
+    stage = Stage(controller=replace(controller, gate=None), plant=plant)
     samples, farthest = _count_samples(controller, plant, completed), _find_farthest(plant, completed)
     rest, dry = controller.force_limit(0.0), sum(find_dry_friction(plant, completed).values())
     efforts = [NOMINAL_EFFORT[controller.command.mechanics]]  # N or N m, that a step asks for at once
@@ -90,8 +80,9 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
     steps: list[ImpedanceStep] = []
     for effort in efforts:
         size = min(effort / outer.stiffness, farthest)
-        run = run_loop(loop, [params], np.full(samples, size))
-        limit = law.command_limit * (1.0 - 1e-9)
+        push = Phase(duration_s=samples * outer.sample_time_s, force_N=outer.direction * outer.stiffness * size)
+        scenario = Scenario(name="step of x_0", phases=(push,), friction="sticking" if can_stick(plant) else "smooth")
+        run, limit = play(stage, scenario, [params]), stage.law.command_limit * (1.0 - 1e-9)
         steps.append(_judge(run.outputs[motion][0], size, bool(np.max(np.abs(run.current)) >= limit)))
     return tuple(steps)
 

@@ -15,6 +15,7 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.files import to_json
 from seaopt.problem.stages import tune_problem
 from seaopt.robustness import Certificate
+from seaopt.robustness.certificate import impedance
 from tests.words import flatten
 
 HELD, FREE = so.plants.rotary("locked"), so.plants.rotary()
@@ -53,9 +54,9 @@ def force():
 
 
 def certify(force, damping, ranges=None, values=VALUES, limit_A=None):
-    impedance = Impedance(stiffness=40.0, damping=damping, velocity_filter_s=5e-3)
+    asked = Impedance(stiffness=40.0, damping=damping, velocity_filter_s=5e-3)
     limited = replace(force, spec=replace(force.spec, current_limit_A=limit_A))
-    controller = add_impedance(limited, FREE, values, impedance, name="free")
+    controller = add_impedance(limited, FREE, values, asked, name="free")
     return so.certify(controller, {"free": FREE}, values, samples=5, ranges=ranges, simulations=False)
 
 
@@ -78,6 +79,7 @@ def test_a_passive_impedance_is_certified(certificate):
 
 def test_one_that_is_not_fails_and_names_what_breaks_it(force):
     certificate = certify(force, 12.0)
+    assert impedance.WITHOUT_STIFFNESS not in certificate.notes
     assert not certificate.passed
     row = find(certificate, "impedance_damper")
     assert not row.met and row.value > 0.3
@@ -93,6 +95,12 @@ def test_it_is_in_the_json_and_read_again(certificate):
     assert read.impedance.rendering.needed_damper == pytest.approx(content["impedance"]["needed_damper"])
     assert read.impedance.draws == certificate.impedance.draws and read.impedance.draws.passive == 5
     assert read.impedance.steps == certificate.impedance.steps
+
+
+def test_damping_alone_says_that_scenarios_run_the_force_law(force):
+    damped = add_impedance(force, FREE, VALUES, Impedance(stiffness=0.0, damping=1.0), name="free")
+    certificate = so.certify(damped, {"free": FREE}, VALUES, samples=5, simulations=False)
+    assert impedance.WITHOUT_STIFFNESS in certificate.notes and certificate.steps.met
 
 
 @pytest.mark.slow

@@ -98,7 +98,7 @@ def refuse_to_simulate(*args, **keywords):
 def no_simulation(monkeypatch):
     for module, names in (
         (scenarios, ("run_loop",)), (verification, ("play",)), (limit_cycles, ("run_loop",)),
-        (impedance_steps, ("run_loop",)), (large_signal, ("run_loop",)),
+        (impedance_steps, ("play",)), (large_signal, ("run_loop",)),
     ):  # fmt: skip
         for name in names:
             monkeypatch.setattr(module, name, refuse_to_simulate)
