@@ -10,7 +10,7 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ParameterError, PlantError
 from seaopt.parameters import Parameter
-from seaopt.plants.sensors.deflection import evaluate_weights
+from seaopt.plants.sensors.deflection import evaluate_weights, find_scale
 from seaopt.robustness.verification.playback import Stage
 
 KNEE = {"J_m": 1e-4, "b_r": 1e-3, "K_tau": 0.05, "N": 50.0, "k_s": 300.0, "c_s": 1.5, "J_l": 0.1, "d_l": 0.05}
@@ -32,6 +32,18 @@ def test_deflection_lacks_the_damping_that_a_load_cell_reads():
     for output, above in (("tau_d", 320.0 + 0 * s), ("tau_s", k["k_s"] + k["c_s"] * s)):
         response = plant.linearize(params)(s)[list(plant.outputs).index(output), 0]
         np.testing.assert_allclose(response, above * k["K_tau"] * k["N"] / below, rtol=1e-10)
+
+
+def test_a_law_says_by_what_the_firmwares_stiffness_is_off():
+    """At rest tau_d = k_n delta and tau_s = k_s delta, so that a reference acts with k_s/k_n of its size."""
+    plant, params = make_knee()
+    spec = so.ControllerSpec(measured="tau_d", bandwidth_hz=15, sample_rate_hz=1000)
+    controller = so.tune(plant, params, spec)
+    text = " ".join(controller.notes)
+    assert "tau_d reads 1.067 times the spring's torque" in text and "0.9375 times a reference acts" in text
+    assert np.isclose(controller.close(plant, params).tracking(np.array([1e-3]))[0].real, 1.0, rtol=1e-3)
+    right = plant.complete(params.update(k_n=300.0))
+    assert np.isclose(find_scale(plant, right, "tau_d"), 1.0) and find_scale(plant, right, "tau_s") is None
 
 
 def test_a_screw_has_a_force_from_deflection():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,7 @@ from seaopt.plants.friction import find_dry_friction, name_slope_unit, split_fri
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
+from seaopt.plants.sensors.deflection import find_scale
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.units import divide_units
 
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 
 # Among what controller.json says is achieved:
 FRICTION_MARGIN, WITHOUT_PREFILTER = "friction_margin", "bandwidth_without_prefilter_hz"
+SCALE = (5e-3, 5.0)  # by which a reading is off, from and up to: play at rest is no other stiffness
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 ARRIVAL_PERIODS, NOT_ARRIVED = 20.0, 0.05  # of the bandwidth, after which a step is to be nearer than this share
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
@@ -271,8 +273,19 @@ class Controller(LoopDelays, Result, Worded):
         if self.friction is None and self.spec.level("min_friction_margin") is not None:
             notes.append("the design plant has no friction at these values: any min_friction_margin holds on it")
         notes += actuation_notes(plant, self.command)
+        notes += self._scale_notes(plant, values)
         notes += limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None)
         return (*notes, *self._noise_notes(), *self._rest_notes(), *self._slow_notes())
+
+    def _scale_notes(self, plant: Plant, values: ParameterSet) -> Iterator[str]:
+        """Yield by what the regulated reading is off, where firmware computes it with another stiffness."""
+        scale = find_scale(plant, plant.complete(values), self.spec.regulated)
+        if scale is not None and SCALE[0] < abs(scale - 1.0) and 1.0 / SCALE[1] < scale < SCALE[1]:
+            yield (
+                f"{self.spec.regulated} reads {scale:.4g} times the spring's {self.command.mechanics.word}, as it is "
+                f"computed with another stiffness: {1.0 / scale:.4g} times a reference acts on the link; correct the "
+                "firmware's constant, or scale the reference"
+            )
 
     def _noise_notes(self) -> list[str]:
         """Return what is fed forward of the link, and which noise is large because nothing was asked of it."""

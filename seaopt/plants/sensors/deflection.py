@@ -85,6 +85,21 @@ def weigh_encoders(plant: Plant, output: str) -> dict[str, Any]:
     return weights
 
 
+def find_scale(plant: Plant, params: CompletedParameters, output: str) -> float | None:
+    """Return how many times the spring's own effort a reading of encoders is, with the motor moved from rest; None where
+    the output is none, or passes a filter.
+    """
+    sensing = plant.sensing
+    if sensing is None or output not in sensing.from_encoders or sensing.motor_position not in plant.states:
+        return None
+    motor, names = list(plant.states).index(str(sensing.motor_position)), list(plant.outputs)
+    rows = [names.index(name) for name in (output, sensing.regulated[0])]
+    slopes = ca.densify(ca.jacobian(plant.output, plant.x[motor])[rows])
+    at_rest = ca.Function("slopes", [plant.t, plant.x, plant.u, plant.p], [slopes])
+    read, own = at_rest(0.0, 0.0, 0.0, params.vector).full().ravel().tolist()
+    return read / own if read and own else None
+
+
 def keep_weights(plant: Plant) -> Sensing | None:
     """Return the sensing of a plant whose outputs pass a filter, behind which their slopes are not the encoders'."""
     sensing = plant.sensing
