@@ -342,7 +342,12 @@ def _require_responses(
     values, over = (others or ParameterSet()).with_parameters(*fitted.values()), schedule.over
     rows: list[Requirement] = []
     for name, response in measured.items():
-        place = find_response_place(over, name, response, values)
+        place, points = find_response_place(over, name, response, values), schedule.points
+        if not points[0] <= place <= points[-1]:
+            raise ControlError(
+                f"measured: {name} was taken at {over} = {place:g}, outside the points; leave it out, or give points "
+                "that reach there"
+            )
         of_response = measured_requirements(schedule.at(place), name, response)
         rows += [replace(row, place=(over, place)) for row in of_response]
     return rows

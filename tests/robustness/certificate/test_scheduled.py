@@ -253,6 +253,8 @@ def test_a_measured_response_is_judged_with_the_law_of_the_value_that_the_parame
     assert rows["max_sensitivity"].place == ("phi", 0.2)
     assert rows["max_sensitivity"].value == pytest.approx(np.max(np.abs(1.0 / (1.0 + response * law * q))), rel=2e-3)
     elsewhere = replace(measured, name="other", values={"phi": 0.4})
+    with pytest.raises(ControlError, match="frf:other was taken at phi = 3, outside the points"):
+        _require_responses(schedule, None, there, {"frf:other": replace(elsewhere, values={"phi": 3.0})})
     both = _require_responses(schedule, None, there, {"frf:other": elsewhere, "frf:chirp": measured})
     assert [row.place for row in both if row.name == "max_sensitivity"] == [("phi", 0.4), ("phi", 0.2)]
     with pytest.raises(ControlError, match="one value of phi, which is not given"):
