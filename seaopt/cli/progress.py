@@ -18,7 +18,8 @@ from seaopt.progress import Progress
 
 SHOWN_AFTER_S = 2.0  # a stage that is done before shows no progress
 LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
-CAUTION = 1.5  # times what the measured speed makes of the remaining share
+# CAUTION: times what the measured speed makes of the remaining share; MOST: times what was spent, for which is told
+CAUTION, MOST = 2.5, 5.0
 RECENT, LEAST_RECENT_S = 0.25, 2.0  # of the time spent: the part whose speed counts by itself
 MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 REPORT_S = 30.0  # between lines of progress that go to a file
@@ -56,7 +57,7 @@ class TimeLeft:
         slowness = max((last - started) / share, (last - since) / (share - before))
         silent = now - last  # what is silent for longer than was told takes longer
         end = now + CAUTION * max((1.0 - share) * slowness - silent, self._longest - silent, silent)
-        if end > self._end:
+        if end > self._end or end - now > MOST * (now - started):
             return ""
         self._end = end
         left_s = end - now

@@ -217,9 +217,13 @@ def follow(moves, asked):
 
 def test_the_time_left_is_that_of_the_share_that_is_done():
     steady = [(float(t), t / 100.0) for t in range(1, 100)]
-    told = ["", "at most 2 min left", "at most 80 s left", "at most 20 s left"]
-    assert follow(steady, [1.0, 20.0, 50.0, 90.0]) == told
-    assert follow([(60.0, 0.1)], [60.0]) == ["at most 14 min left"] and follow([], [5.0]) == [""]
+    told = ["", "at most 3 min left", "at most 2 min left", "at most 30 s left"]
+    assert follow(steady, [1.0, 40.0, 60.0, 90.0]) == told
+    assert follow([(60.0, 0.4)], [60.0]) == ["at most 4 min left"] and follow([], [5.0]) == [""]
+
+
+def test_a_number_many_times_what_was_spent_is_not_told():
+    assert follow([(60.0, 0.1)], [60.0]) == [""]
 
 
 def test_what_turns_slow_ends_before_what_was_told_or_nothing_is():
@@ -227,19 +231,20 @@ def test_what_turns_slow_ends_before_what_was_told_or_nothing_is():
     moves = [(0.1 * k, 0.06 * k) for k in range(1, 11)] + [(1.0 + k, 0.6 + 0.4 * k / 30) for k in range(1, 31)]
     asked = [4.0, 11.0, 21.0, 26.0]
     told = follow(moves, asked)
-    assert told[0] and told[-1]
+    assert told[1] and told[-1]
     for at, text in zip(asked, told, strict=True):
-        assert not text or 31.0 - at <= float(text.split()[2]) < 2.0 * (31.0 - at) + 10.0, (at, text)
+        seconds = float(text.split()[2]) * (60.0 if "min" in text else 1.0) if text else 31.0 - at
+        assert 31.0 - at <= seconds < 3.0 * (31.0 - at) + 10.0, (at, text)
 
 
 def test_a_number_that_was_told_never_rises():
     """Half in ten seconds, and then nothing: the stage is not two thirds done, and no number says when it is."""
     told = follow([(1.0, 0.1), (10.0, 0.5)], [10.0, 16.0, 30.0, 300.0])
-    assert told == ["at most 20 s left", "at most 10 s left", "", ""]
+    assert told == ["at most 30 s left", "at most 20 s left", "", ""]
 
 
 def test_the_last_part_may_take_as_long_as_the_longest_did():
-    assert follow([(1.0, 0.1), (41.0, 0.9), (42.0, 0.98)], [42.0]) == ["at most 60 s left"]
+    assert follow([(1.0, 0.1), (41.0, 0.9), (42.0, 0.98)], [42.0]) == ["at most 2 min left"]
 
 
 def test_nothing_is_left_to_tell_at_the_end():

@@ -9,6 +9,7 @@ import pytest
 import seaopt as so
 from seaopt.control.laws.verdict import advise_easing
 from seaopt.reporting.sections.data import Commands
+from seaopt.reporting.sections.kinds import controller as controllers
 from seaopt.reporting.sections.kinds.certificate import advise, judge
 from seaopt.robustness.certificate.requirement import Requirement
 from seaopt.robustness.certificate.simulated import STEPS
@@ -40,3 +41,17 @@ def test_only_a_limit_that_binds_is_eased(stand, thor):
     bound = replace(controller, active_constraints=("max_noise_gain", "max_complementary (stand)", "max_noise_gain"))
     assert advise(error, bound).endswith("or raise max_noise_gain and max_complementary")
     assert advise_easing(("min_sensitivity_bandwidth_hz", "shoulder_hz")) == "lower min_sensitivity_bandwidth_hz"
+
+
+def test_a_link_that_nothing_holds_is_what_an_integral_fails_on(stand, thor):
+    """A free mass takes no lasting force: P(0) = 0, which cancels an integral. To ease a limit changes nothing."""
+    free = so.plants.two_link(link2="mass", spring="link2")
+    values = thor.with_parameters(*free.defaults.values()).update(m_2=3.0)
+    plants = {"free": free}
+    controller = so.tune(stand, values, SPEC, robust_to=plants)
+    verdict = controllers.judge(controller, Commands())
+    assert "nothing holds the link there" in verdict.reasons[0].what
+    assert not any("raise" in text or "lower" in text for text in verdict.next)
+    certificate = so.certify(controller, plants, values, samples=2, simulations=False)
+    where = judge(certificate, Commands()).reasons[0].where
+    assert "nothing holds the link there" in where and "tune with that plant" not in where

@@ -78,6 +78,8 @@ from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, divide, ignore
 
 FRACTION_FREQUENCIES = 1500
+# Hz and share of the bandwidth: from there down to here a gain falls so far where nothing holds the link.
+STILL_HZ, LASTING, FALLS = 1e-4, 0.1, 0.01
 NO_FORCE = 0.02  # of the design plant's static gain: where the force answers less, the feedback does next to nothing
 USUAL_MS = 1.7  # that the fraction of a feedforward is chosen for where no Ms is asked
 SOLUTION, BANDWIDTHS, EASING = 1.0, 2.0, 2.0  # of the time of a tune that is not possible as asked
@@ -550,8 +552,20 @@ def _find_rest_gain(task: Task) -> float | None:
     return None if allowed is None or task.spec.structure == "pd" or at_rest <= allowed else at_rest
 
 
+def _has_unheld(task: Task) -> bool:
+    """Tell whether the law integrates, and no effort lasts on some plant: at rest its gain is zero."""
+    f = np.array([STILL_HZ, LASTING * task.spec.bandwidth_hz])
+    gains = [np.abs(plant.response(f)) for plant in task.plants if isinstance(plant, DigitalPlant)]
+    return task.spec.structure != "pd" and any(still < FALLS * moving for still, moving in gains)
+
+
 def _explain_rest(task: Task, text: str) -> str:
-    """Return what is said of a broken limit; of a noise gain that no integral keeps, that, too."""
+    """Return what is said of a broken limit; of a noise gain, or of a stability, that no integral keeps, that, too."""
+    if text.startswith("stability") and _has_unheld(task):
+        return (
+            f"{text}: nothing holds the link there, so that no effort lasts on it, and an integral drifts; take "
+            'structure = "pd", or leave that plant out of robust_to'
+        )
     at_rest = _find_rest_gain(task) if text.startswith("max_noise_gain") else None
     if at_rest is None:
         return text

@@ -27,8 +27,8 @@ from seaopt.records import record
 
 Status = Literal["converged", "max_iterations", "stalled"]
 STILL_MOVING = (
-    "still moving when its iterations were used up; start closer, fix a parameter, or in Python give the method a "
-    "larger max_iterations"
+    "still moving when its iterations were used up; start closer, fix a parameter, or give the method a larger "
+    "max_iterations (in Python)"
 )
 Callback = Callable[[str, float], None]  # (phase and round, cost) of each iteration of a search
 DampedSolver = Callable[[float, Vector], Vector]  # (lambda, b) -> (H + lambda)^-1 b

@@ -61,7 +61,10 @@ class OutputError(Method):
     """
 
     key: ClassVar[str] = "output_error"
-    remedy: ClassVar[str] = "the simulation may run away: try PredictionError() or MultipleShooting()"
+    remedy: ClassVar[str] = (
+        "the simulation may run away: try another method, PredictionError() or MultipleShooting(), method = "
+        '"prediction_error" or "multiple_shooting" in [fit]'
+    )
 
     def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle from the best start that can be found."""

@@ -28,6 +28,7 @@ COARSE_LEVELS, FINE_LEVELS = 32, 4096  # in a channel's range: a warning below t
 MOST_BRIDGED = 50  # missing samples in a row of a device with times of its own
 PART = 0.1  # of a log: where no more of it is without holes, they are everywhere
 LEAST_CORRELATION = 0.3  # correlation above which a lag is one
+SURELY_AHEAD = 0.5  # above which an output that is ahead is no chance: a place that drifts is 0.4 ahead of its input
 
 
 @record
@@ -276,7 +277,7 @@ def find_pair_faults(pair: ChannelPair, period: float, driven: bool) -> Iterator
     text = f"{late} follows {early} by {1e3 * abs(pair.lag_s):.3g} ms ({abs(samples):.2f} samples), correlation "
     text += f"{pair.correlation:.2f}" + (" (with the opposite sign)" if pair.correlation < 0.0 and not driven else "")
     severity: Severity = "note"
-    if driven and pair.leads and samples < -1.5:
+    if driven and pair.leads and samples < -1.5 and abs(pair.correlation) > SURELY_AHEAD:
         severity = "warning"
         text += "; an input cannot come after what it causes: align the channels"
     elif driven and samples > 0:

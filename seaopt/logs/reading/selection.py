@@ -23,7 +23,7 @@ from seaopt.signals import check_distinct
 from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
 _TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
-_TIME_ENDING = re.compile(r"_(s|ms|us|ns)$")
+_TIME_ENDING = re.compile(r"[_ ](s|ms|us|ns)$")
 MAX_NAMES = 20  # in a message
 HOW_TO_ALIGN = "align it by Hold(), Linear(), Nearest(tolerance_s=...) or Readings()"
 ALIGNED = ({"align": {"hold": {}}}, {"align": {"linear": {}}})  # the same as keys

@@ -148,7 +148,8 @@ def is_m_open(header: Header) -> bool:
 def find_unit_in_name(name: str) -> str | None:
     """Return the unit that a name ends in, as i_cmd_A or time_s; None where it ends in none, or in what may be none."""
     header = read_header(name)
-    return header.unit if header.unit and is_unit(header.unit) and not is_m_open(header) else None
+    known = is_unit(header.unit) and not is_count(header.unit) and not is_m_open(header)
+    return header.unit if header.unit and known else None
 
 
 def is_count(unit: str) -> bool:

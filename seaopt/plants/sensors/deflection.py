@@ -86,7 +86,7 @@ def weigh_encoders(plant: Plant, output: str) -> dict[str, Any]:
 
 
 def find_scale(plant: Plant, params: CompletedParameters, output: str) -> float | None:
-    """Return how many times the spring's own effort a reading of encoders is, with the motor moved from rest; None where
+    """Return how many times the spring's own effort a reading of encoders is as the motor moves from rest; None where
     the output is none, or passes a filter.
     """
     sensing = plant.sensing

@@ -78,7 +78,7 @@ def judge(certificate: Certificate, commands: Commands) -> Verdict:
         return Verdict(met=True, text=text)
     broken = [row for row in certificate.requirements if not row.met]
     failures = group_failures(broken)
-    reasons = [explain_failure(failure) for failure in failures]
+    reasons = [explain_failure(failure, certificate.controller) for failure in failures]
     remedies = [advise(failure.worst, certificate.controller) for failure in failures]
     if certificate.constrained is not None:
         remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]
@@ -115,18 +115,19 @@ def advise(row: Requirement, *controllers: Controller) -> str:
         plants = {DESIGN_PLANT, *(name for law in controllers for name in law.robust_to)}
         if limit.scope == "every plant" and row.plant not in plants and all(law.met for law in controllers):
             return f'add "{row.plant}" to robust_to in [controller]'
-        remedy = limit.remedy
+        unmet = [text for law in controllers if not law.met for text in law.blocked_by]
+        remedy = f"the tuning says why: {unmet[0]}" if unmet else limit.remedy
     among = EASED_BY.get(row.name, ()) if limit is None else limit.eased_by
     easing = advise_easing([label for law in controllers for label in law.active_constraints], among)
     return f"{remedy}, or {easing}" if easing else remedy
 
 
-def explain_failure(failure: Failure) -> Reason:
-    """Return what a certificate fails on, by its worst case."""
+def explain_failure(failure: Failure, *controllers: Controller) -> Reason:
+    """Return what a certificate fails on, by its worst case; `controllers`: the laws it is of."""
     row = failure.worst
     if failure.unstable:
         what = f"unstable on {', '.join(failure.subjects)}"
-        return Reason(what=what, where=f"tune with that plant in robust_to{failure.consequence}")
+        return Reason(what=what, where=f"{advise(row, *controllers)}{failure.consequence}")
     value, limit = format_number(row.value, 4), format_number(row.limit, 4)
     return Reason(what=f"{row.name} {value}, limit {row.sense} {limit}", where=row.where, count=failure.count)
 

@@ -58,7 +58,8 @@ def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[str, 
     if possible.nearest_hz:
         nearest = min(possible.nearest_hz, key=lambda hz: abs(hz - asked))
         return (text, f"bandwidth_hz = {nearest:.4g} in [controller], or {look}")
-    easing = advise_easing(controller.active_constraints)
+    unstable = any(name.startswith("stability") for name in controller.active_constraints)
+    easing = "" if unstable else advise_easing(controller.active_constraints)  # figures of no stable law bind nothing
     return (text, f"{easing} in [controller]; {look}" if easing else look)
 
 
