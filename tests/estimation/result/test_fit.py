@@ -116,23 +116,6 @@ def test_misra1a_values_and_standard_errors_are_nists():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_causes")
-def test_intervals_cover_the_truth(stand, thor):
-    """95 % intervals of J, b_r, eta over 60 seeds (180 intervals)."""
-    inside = 0
-    for seed in range(60):
-        noise = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
-        log = so.virtual_log(
-            stand, thor, (Noise(std=1.0, band_hz=50),), duration_s=6, rate_hz=400, seed=seed, sensors=noise
-        )
-        fit = so.fit([experiment(stand, log)], thor.free(*FREE), method=so.OutputError(search=False))
-        for name in FREE:
-            low, high = fit.parameters[name].ci95
-            inside += low <= thor[name].value <= high
-    assert 0.89 <= inside / 180 <= 0.99
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("without_causes")
 def test_coloured_residuals_widen_the_intervals(stand, thor):
     """Noise with a correlation time of 0.1 s: the stated std matches the scatter of the estimates over seeds."""
     found, stated = [], []
