@@ -27,12 +27,10 @@ COVERED = 1.959964  # standard deviations of a 95 % interval
 
 
 def read(fit: so.Fit, name: str) -> tuple[float, float]:
-    """Return a figure of a fit and its standard deviation."""
-    if name == "delay_s":
-        own = fit.nuisance["experiment"]
-        return own.delay_s, own.std["delay_s"]
-    figure = fit.derived[name] if name in fit.derived else fit.parameters[name]
-    return figure.value, figure.std
+    """Return a figure of a fit and its standard deviation, of noise and model."""
+    own = fit.nuisance["experiment"].fitted
+    figure = own[name] if name in own else fit.derived[name] if name in fit.derived else fit.parameters[name]
+    return figure.value, figure.total_std
 
 
 def main() -> None:
@@ -44,11 +42,11 @@ def main() -> None:
     goal, begin = joint.sweep(), time.perf_counter()
     angles = joint.simulate({name: np.array([one[name] for one in joints]) for name in joints[0]}, goal)
     print(f"{len(joints)} joints simulated in {time.perf_counter() - begin:.0f} s")
-    error, std, busy, failed = [], [], [], 0
+    error, std, busy, failed, met = [], [], [], 0, 0
     for seed, truth in zip(seeds, joints, strict=True):
         begin = time.process_time()
         try:
-            fit = joint.fit_elastic(joint.record(goal, angles[:, :, seed - 1], seed), diagnostics=False)
+            fit = joint.fit_elastic(joint.record(goal, angles[:, :, seed - 1], seed))
         except KeyboardInterrupt:
             break
         busy.append(time.process_time() - begin)
@@ -56,9 +54,9 @@ def main() -> None:
         value, spread = zip(*(read(fit, name) for name in FIGURES), strict=True)
         error.append(value / known - 1.0)
         std.append(spread / known)
-        failed += fit.status != "converged"
+        failed, met = failed + (fit.status != "converged"), met + fit.met
     error, std = np.array(error), np.array(std)
-    print(f"{len(error)} joints fitted")
+    print(f"{len(error)} joints fitted, {met} met")
     print(f"{failed} did not converge; a fit takes {np.median(busy):.2f} s of processor time, at most {max(busy):.2f}")
     print(f"{'':17s} covered   largest error   std      scatter/std   bias/std")
     for name, e, s in zip(FIGURES, error.T, std.T, strict=True):

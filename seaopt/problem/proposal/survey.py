@@ -134,7 +134,7 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
         moved, overlap = _move_to_clock(columns[chosen], others, headers, raw)
         columns |= moved
     size = raw[chosen or members[0]].size
-    wrong = {name: _describe_length(raw[name].size, size) for name in numeric if name not in {**columns, **groups}}
+    wrong = {name: _describe_length(raw[name], size) for name in numeric if name not in {**columns, **groups}}
     moving = [column for name, column in columns.items() if name != chosen and name not in times and column.swing > 0.0]
     if not moving:
         others = [name for name in wrong if raw[name].size > 1]
@@ -271,8 +271,9 @@ def _move_to_clock(
     return moved, (low, high) if low < high else None
 
 
-def _describe_length(size: int, usual: int) -> str:
-    return "one number, beside the log" if size == 1 else f"{size} samples, where the log has {usual}"
+def _describe_length(values: Float[np.ndarray, " n"], usual: int) -> str:
+    one = values.size == 1
+    return f"one number beside the log, {values[0]:.6g}" if one else f"{values.size} samples, where the log has {usual}"
 
 
 def _find_copies(columns: Sequence[SurveyedColumn]) -> dict[str, str]:
