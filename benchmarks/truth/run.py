@@ -65,7 +65,8 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
     rng, kind = np.random.default_rng(seed), KINDS[actuator.kind]
     base = so.plants.high_impedance() if kind.linear else so.plants.rotary(link=actuator.link)
     plant = so.plants.let_stick(base)
-    known = {name: value for name, value in actuator.truth.items() if name in plant.parameters}
+    truth = actuator.find_truth(seconds=seconds, seed=seed)
+    known = {name: value for name, value in truth.items() if name in plant.parameters}
     free = FREE[kind.linear]
     guess = {name: known[name] * 2.0 ** rng.uniform(-1, 1) for name in free}
     params = plant.defaults.update(**known | guess).free(*free)
