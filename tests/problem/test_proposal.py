@@ -405,6 +405,21 @@ def test_a_column_that_is_not_used_says_why(tmp_path, logs):
     }  # fmt: skip
 
 
+def test_the_place_of_a_load_on_a_belt_is_named_with_the_plant_that_has_it(tmp_path, logs):
+    """A position on the load's side, which neither a held nor a swinging link has."""
+    free = logs["free"]
+    columns = {
+        "t [s]": logs["t"],
+        "I [A]": free["I"],
+        "MotEnc_cnt": steps(free["theta_m"]),
+        "LoadPos_um": free["tau_s"],
+    }
+    proposal = propose([write_csv(tmp_path / "a.csv", columns)], {"actuator": "linear"}, tmp_path)
+    rows = {row.column: row for row in proposal.columns}
+    assert 'kind = "two_link" has it as x_2' in rows["LoadPos_um"].description
+    assert 'measured = "tau_d", or "F_d" of a screw' in proposal.text
+
+
 def test_wrong_roles_can_be_put_right(tmp_path, logs):
     held = logs["held"]
     path = write_csv(tmp_path / "a.csv", {"t [s]": logs["t"], "a": held["theta_m"], "b": held["I"], "c": held["tau_s"]})

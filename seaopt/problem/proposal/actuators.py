@@ -229,7 +229,7 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     lines = _Lines(interview, facts, thor(), "N/m")
     forces, moves = facts.outputs & {"F1", "F2"}, "swing" in facts.places
     why = "a typical value; take it from the data sheet"
-    lines.known("l", "Lead of the screw l (travel for one turn)", why=why)
+    lines.known("l", "Travel l for one turn (lead of the screw, or circumference of the belt's pulley)", why=why)
     lines.known("N_p", "Reduction N_p between motor and screw", 1.0, "driven directly")
     _add_drive(lines, facts, effort=bool(forces))
     lines.free("J", 1e-5)

@@ -71,7 +71,13 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
         lines += ["", "[controller]", *_align(_describe_controller(logs, actuator, interview))]
         lines += ["", "[robustness]", *_align(_describe_robustness(logs, actuator))]
     else:
-        lines += ["", "# No [controller]: these logs have no torque or force, and not both encoders of the spring."]
+        lines += [
+            "",
+            "# No [controller]: these logs have no torque or force to regulate. From encoders on both sides of the",
+        ]
+        lines += [
+            '# spring firmware makes one: parts = ["deflection_sensor"], measured = "tau_d", or "F_d" of a screw.'
+        ]
     if guessed := interview.list_guessed():
         head += [
             "# Guesses; every verdict lists them. Once you have measured one, correct it and remove it here.",

@@ -121,7 +121,7 @@ def propose(
     if stated.rotary is not None:
         turns = stated.rotary
     elif doubt:
-        text, guess = "Is the actuator rotary (a gear) or linear (a screw)?", "rotary" if turns else "linear"
+        text, guess = "Is the actuator rotary (a gear) or linear (a screw or a belt)?", "rotary" if turns else "linear"
         turns = interview.ask("actuator", text, guess, doubt, ("rotary", "linear")) == "rotary"
     assignments = [_assign(survey, interview, turns, stated) for survey in surveys]
     pairs = list(zip(surveys, assignments, strict=True))

@@ -120,6 +120,8 @@ def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, Sur
     taken = [roles[role].name for role in (own | {"angle": places}).get(header.quantity, ()) if role in roles]
     if taken:
         return f"{join_words(taken)} {'is' if len(taken) == 1 else 'are'} that already"
+    if not rotary and header.quantity == "length":
+        return 'the place of a load that slides, which no plant here has; kind = "two_link" has it as x_2'
     return f"no output of an actuator with a {'gear' if rotary else 'screw'}"
 
 
