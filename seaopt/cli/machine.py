@@ -18,7 +18,7 @@ from seaopt.cli.provenance import FILES
 from seaopt.cli.session import SCHEMAS, Session
 from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal
-from seaopt.control import Controller, ControllerSpec, ScheduledController
+from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
 from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json, write_text
@@ -28,12 +28,12 @@ from seaopt.machine.acceptance import take_ranges
 from seaopt.machine.bringup_files import write_stage
 from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
-from seaopt.machine.stepped import Source
+from seaopt.machine.stepped import Source, limit_law
 from seaopt.problem import certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.problem.stages import list_plants
 from seaopt.reporting.sections import judge
-from seaopt.robustness import Certificate, JointTuning
+from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate, linear_controller
 from seaopt.signals import REFERENCE
 
 FILE, PAGE = "acceptance.json", "acceptance.html"
@@ -75,8 +75,7 @@ def accept_logs(
         path = folder / BRING_UP / stage / FILES["tune"]
         if not path.is_file():
             raise ProblemError(f"--stage {stage}: {path} is not there; make it: seaopt bringup {problem} -o {folder}")
-        plant = list_plants(session.problem, session.parameters())[0]
-        source = Controller.from_dict(read_json(path, SCHEMAS["tune"]), plant, session.values())
+        source = _read_stage(session, path)
     controller = law.controllers[0] if isinstance(law, ScheduledController) else law
     units = _list_units(controller)
     if isinstance(source, ScheduledController):
@@ -117,20 +116,16 @@ def _show(
     return result.met
 
 
-def _take_controller(session: Session) -> Controller:
-    law = session.law()
-    if session.problem.mpc is not None:
-        raise ProblemError(
-            f"{session.problem.source}: predictive control has no stages; try the machine with a law first, in a "
-            'problem file with structure = "pid" and without [mpc]; then seaopt accept judges it as any other'
-        )
-    if not isinstance(law, Controller):
-        raise ProblemError(
-            f"{session.problem.source}: a schedule has no stages; keep {law.over} at a value, and plan those of the "
-            f"law there in Python: so.bring_up(schedule.at({law.points[0]:g}), ...); schedule is what "
-            "so.tune_certified returns, its controller"
-        )
-    return law
+def _read_stage(session: Session, path: Path) -> Source:
+    """Return the law of a stage of a bring-up."""
+    problem, content = session.problem, read_json(path, SCHEMAS["tune"])
+    if problem.mpc is not None:
+        limits = content["mpc"]["spec"]
+        return limit_law(session.plan(), limits["current_limit_A"] or limits["command_limit"])
+    if problem.schedule is not None:
+        others = problem.robust_to(session.parameters())
+        return ScheduledController.from_dict(content, problem.design_plant, session.values(), others)
+    return Controller.from_dict(content, list_plants(problem, session.parameters())[0], session.values())
 
 
 def _list_units(controller: Controller) -> dict[str, str]:
@@ -201,7 +196,10 @@ def plan_bring_up(
 ) -> bool:
     """Plan the stages of the folder's controller, write and print them; return whether each has a certified law."""
     session, zeroing = Session(problem, folder), parse_tare(tare)
-    controller, source, errors = _take_controller(session), session.parameters(), Terminal(stderr=True)
+    law, source, errors = session.law(), session.parameters(), Terminal(stderr=True)
+    controller: Source = law if session.problem.mpc is None else session.plan()
+    if zeroing is not None and isinstance(controller, ForceMPC):
+        raise ProblemError(f"--tare {tare}: predictive control has no C beside it that averages a zero; leave it out")
 
     def tune_stage(spec: ControllerSpec) -> Controller:
         tuned = tune_problem(replace(session.problem, spec=spec), source)
@@ -209,10 +207,10 @@ def plan_bring_up(
         assert isinstance(tuned, Controller)
         return tuned
 
-    def certify_stage(law: Controller) -> Certificate:
-        judged = certify_problem(session.problem, law, source)
-        assert isinstance(judged, Certificate)
-        return judged
+    def certify_stage(law: Source) -> Certificate | ScheduleCertificate:
+        if isinstance(law, ForceMPC):
+            return certify_problem(replace(session.problem, mpc=law.spec), linear_controller(law), source)
+        return certify_problem(session.problem, law, source)
 
     target = folder / BRING_UP
     with show_progress(errors, "planning the stages", errors.say) as tell:

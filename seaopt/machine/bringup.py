@@ -10,18 +10,19 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.codec import to_content
-from seaopt.control import Controller, ControllerSpec
+from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
 from seaopt.machine.design_run import run_design
 from seaopt.machine.excitation import Excitation, design_excitation
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
+from seaopt.machine.stepped import Source, limit_law, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
 from seaopt.records import Result, Worded, record
-from seaopt.robustness import Certificate, certify, tune_certified
+from seaopt.robustness import Certificate, ScheduleCertificate, certify, tune_certified
 from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.signals import REFERENCE
 
@@ -52,8 +53,11 @@ class Stage:
     ----------
     name : str
         Of its folder.
+    source : Controller, ScheduledController or ForceMPC
+        What is exported.
     controller : Controller
-    certificate : Certificate
+        It, as a law: of a schedule where its variable stands, of predictive control while no limit is active.
+    certificate : Certificate or ScheduleCertificate
     excitation : Excitation
         The reference to play.
     tracking, sensitivity : Band
@@ -66,11 +70,14 @@ class Stage:
         Largest magnitudes; beyond them the stage is to be stopped.
     note : str
         In what the stage differs from what was planned.
+    place : float or None
+        Where a schedule's variable is to stand.
     """
 
     name: str
+    source: Source
     controller: Controller
-    certificate: Certificate
+    certificate: Certificate | ScheduleCertificate
     excitation: Excitation
     tracking: Band
     sensitivity: Band
@@ -78,12 +85,16 @@ class Stage:
     step_size: float | None
     stop: Mapping[str, float]
     note: str = ""
+    place: float | None = None
 
     @property
     def channels(self) -> tuple[str, ...]:
         """What to log in each tick."""
-        controller = self.controller
-        return (REFERENCE, *controller.signals, *controller.further, controller.command.input)
+        controller, source = self.controller, self.source
+        over = (source.over,) if isinstance(source, ScheduledController) else ()
+        return tuple(
+            dict.fromkeys((REFERENCE, *controller.signals, *controller.further, *over, controller.command.input))
+        )
 
 
 @record(eq=False, repr=False)
@@ -110,6 +121,7 @@ def _describe(stage: Stage) -> dict[str, Any]:
         "name": stage.name,
         "note": stage.note,
         "met": stage.certificate.met,
+        "place": stage.place,
         "bandwidth_hz": controller.spec.bandwidth_hz,
         "command_limit": controller.command_limit,
         "channels": stage.channels,
@@ -132,7 +144,7 @@ def _describe(stage: Stage) -> dict[str, Any]:
 
 
 def bring_up(
-    controller: Controller,
+    controller: Source,
     plants: Mapping[str, Plant],
     uncertainty: Fit | ParameterSet,
     *,
@@ -142,9 +154,9 @@ def bring_up(
     share: float = 0.5,
     bias: float = 0.0,
     limits: Mapping[str, float] | None = None,
-    certificate: Certificate | None = None,
+    certificate: Certificate | ScheduleCertificate | None = None,
     tune_stage: Callable[[ControllerSpec], Controller] | None = None,
-    certify_stage: Callable[[Controller], Certificate] | None = None,
+    certify_stage: Callable[[Any], Certificate | ScheduleCertificate] | None = None,
     keep_stage: Callable[[Stage], object] | None = None,
     seed: int = SEED,
     progress: Progress = ignore,
@@ -153,8 +165,9 @@ def bring_up(
 
     Parameters
     ----------
-    controller : Controller
-        The full law, as tuned.
+    controller : Controller, ScheduledController or ForceMPC
+        The full law, as tuned. A schedule, or predictive control, is brought up with a fraction of its effort, a
+        schedule at its first point, then whole, a schedule at each of its points.
     plants : mapping of name to Plant
         As in `certify`.
     uncertainty : Fit or ParameterSet
@@ -200,8 +213,10 @@ def bring_up(
     >>> [(stage.name, stage.controller.spec.bandwidth_hz) for stage in plan.stages]
     [('stage_1', 15.0), ('full', 30)]
     """
-    require_type(controller, Controller, "controller", "give what tune returned", ControlError)
-    if controller.design is None:
+    require_type(
+        controller, (Controller, ScheduledController, ForceMPC), "controller", "give what tune returned", ControlError
+    )
+    if stand(controller, None).design is None:
         raise ControlError("the controller does not know its design plant; read it with Controller.from_dict")
     for fraction in fractions:
         if not 0.0 < require_number(fraction, "fractions", ControlError) < 1.0:
@@ -209,11 +224,11 @@ def bring_up(
     if not 0.0 < require_number(share, "share", ControlError) <= 1.0:
         raise ControlError(f"share = {share:g} is not between 0 and 1; give the part of each limit to use: 0.5")
 
-    def certify_one(law: Controller) -> Certificate:
+    def certify_one(law: Any) -> Certificate | ScheduleCertificate:
         return certify(law, plants, uncertainty, ranges=ranges, samples=samples, seed=seed)
 
     def tune_one(spec: ControllerSpec) -> Controller:
-        assert controller.design is not None
+        assert isinstance(controller, Controller) and controller.design is not None
         plant = controller.design[0]
         options: dict[str, Any] = {"ranges": ranges, "samples": samples, "seed": seed + 1}
         tuned = tune_certified(plant, uncertainty, spec, plants, **options).controller
@@ -222,36 +237,64 @@ def bring_up(
 
     certifying, tuning = certify_stage or certify_one, tune_stage or tune_one
     options: dict[str, Any] = {"share": share, "bias": bias, "limits": dict(limits or {}), "seed": seed}
-    draws = list_draws(controller, uncertainty, ranges, DRAWS, seed)
-    stages: list[Stage] = []
+    over = controller.over if isinstance(controller, ScheduledController) else None
+    inside = {name: ends for name, ends in (ranges or {}).items() if name != over}
+    drawn = list_draws(stand(controller, None), uncertainty, inside, DRAWS, seed)
+    draws = [{name: value for name, value in each.items() if name != over} for each in drawn]
+    places = controller.points if isinstance(controller, ScheduledController) else (None,)
+    stages, count = list[Stage](), len(fractions) + len(places)
 
     def keep(stage: Stage) -> None:
         stages.append(stage)
         if keep_stage is not None:
             keep_stage(stage)
 
-    count = len(fractions) + 1
+    def tell(text: str) -> None:
+        progress(f"stage {len(stages) + 1} of {count}, {text}", len(stages) / count)
+
     for number, fraction in enumerate(sorted(fractions), start=1):
-
-        def tell(text: str, number: int = number) -> None:
-            progress(f"stage {number} of {count}, {text}", (number - 1) / count)
-
-        law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell)
-        part = options | {"share": share * fraction}
+        if isinstance(controller, Controller):
+            law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell)
+        else:
+            law, note = lower_effort(controller, fraction), f"the law with {100.0 * fraction:g} % of its effort"
+            tell(f"certifying with {100.0 * fraction:g} % of the effort")
+            judged = certifying(law)
+        part = options | {"share": share * fraction, "place": places[0]}
         keep(_make_stage(f"stage_{number}", law, judged, note, draws, part))
-    progress(f"stage {count} of {count}, certifying the law itself", 1.0 - 1.0 / count)
-    judged = certifying(controller) if certificate is None else certificate
-    keep(_make_stage("full", controller, judged, "", draws, options))
+    tell("certifying the law itself")
+    whole = certifying(controller) if certificate is None else certificate
+    for number, place in enumerate(places, start=1):
+        name = "full" if len(places) == 1 else f"full_{number}"
+        keep(_make_stage(name, controller, whole, "", draws, options | {"place": place}))
     return BringUp(stages=tuple(stages))
+
+
+def lower_effort(source: Source, fraction: float) -> Source:
+    """Return a law with a fraction of the limit of its command. Raises ControlError: it has none."""
+    limit = source.controllers[0].command_limit if isinstance(source, ScheduledController) else source.command_limit
+    if limit is None:
+        raise ControlError("the command has no limit to lower; give current_limit_A (command_limit)")
+    if isinstance(source, ForceMPC):
+        return replace(limit_law(source, fraction * limit), outer=source.outer)
+    if isinstance(source, ScheduledController):
+        lower = tuple(_limit(each, fraction * limit) for each in source.controllers)
+        return replace(source, controllers=lower)
+    return _limit(source, fraction * limit)
+
+
+def _limit(controller: Controller, limit: float) -> Controller:
+    spec = controller.spec
+    key = "current_limit_A" if spec.current_limit_A is not None else "command_limit"
+    return replace(controller, spec=replace(spec, **{key: limit}))
 
 
 def _find_stage(
     controller: Controller,
     fraction: float,
     tuning: Callable[[ControllerSpec], Controller],
-    certifying: Callable[[Controller], Certificate],
+    certifying: Callable[[Any], Certificate | ScheduleCertificate],
     tell: Callable[[str], None],
-) -> tuple[Controller, Certificate, str]:
+) -> tuple[Source, Certificate | ScheduleCertificate, str]:
     """Return the law of a stage, its certificate, and in what it is another one than planned."""
     spec = controller.spec
     for factor in UPWARDS:
@@ -280,8 +323,7 @@ def _find_stage(
             f"no law near {fraction:g} of {spec.bandwidth_hz:g} Hz is certified, and the command has no limit to "
             "lower; give current_limit_A (command_limit)"
         )
-    key = "current_limit_A" if spec.current_limit_A is not None else "command_limit"
-    lower = replace(controller, spec=replace(spec, **{key: fraction * limit}))
+    lower = lower_effort(controller, fraction)
     note = (
         f"the full law with {100.0 * fraction:g} % of its effort: none near {fraction:g} of its bandwidth is certified"
     )
@@ -291,12 +333,14 @@ def _find_stage(
 
 def _make_stage(
     name: str,
-    controller: Controller,
-    certificate: Certificate,
+    source: Source,
+    certificate: Certificate | ScheduleCertificate,
     note: str,
     draws: Sequence[Mapping[str, float]],
     options: Mapping[str, Any],
 ) -> Stage:
+    place, options = options["place"], {key: value for key, value in options.items() if key != "place"}
+    controller = stand(source, place)
     dry = has_dry_friction(controller)
     phases, periods = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
     excitation = design_excitation(controller, phases=phases, periods=periods, **options)
@@ -313,6 +357,7 @@ def _make_stage(
     time = controller.sample_time_s * np.arange(count)
     return Stage(
         name=name,
+        source=source,
         controller=controller,
         certificate=certificate,
         excitation=excitation,
@@ -322,6 +367,7 @@ def _make_stage(
         step_size=None if limit is None else float(limit / controller.per_effort / np.max(np.abs(effort))),
         stop={key: min(STOP * peak, excitation.limits.get(key, np.inf)) for key, peak in excitation.peaks.items()},
         note=note,
+        place=place,
     )
 
 

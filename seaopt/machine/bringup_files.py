@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from seaopt.control import export
+from seaopt.control import ForceMPC, export, export_mpc
 from seaopt.control.deploy.target import LOG_ROWS, Tare
+from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
 from seaopt.machine.bringup import Band, BringUp, Stage
+from seaopt.machine.stepped import Source
 
 PER_LINE = 8
 HEADER = """/* The reference of a stage of bring-up, made by seaopt: {phases} set(s) of phases, a period of
@@ -91,14 +94,26 @@ def write_stage(stage: Stage, folder: Path | str, *, tare: Tare | None = None) -
     header = HEADER.format(**words, bytes=4 * period * phases, rate=f"{1.0 / excitation.sample_time_s:.10g}")
     source = SOURCE.format(**words, waves=waves)
     return [
-        *export(stage.controller, folder, allow_infeasible=True, log_rows=LOG_ROWS, tare=tare),
-        write_json(folder / "controller.json", stage.controller.to_dict()),
+        *_export(stage.source, folder, tare),
+        write_json(folder / "controller.json", _describe(stage)),
         write_log(log, folder / "reference.csv"),
         write_text(folder / "reference.h", header),
         write_text(folder / "reference.c", source),
         write_text(folder / "expected_step.csv", _table("time [s]", stage.step)),
         write_text(folder / "expected_tracking.csv", _table("frequency [Hz]", stage.tracking)),
     ]
+
+
+def _export(source: Source, folder: Path, tare: Tare | None) -> list[Path]:
+    if isinstance(source, ForceMPC):
+        return [export_mpc(source, folder)]
+    return [*export(source, folder, allow_infeasible=True, log_rows=LOG_ROWS, tare=tare)]
+
+
+def _describe(stage: Stage) -> dict[str, Any]:
+    if isinstance(stage.source, ForceMPC):
+        return stage.controller.to_dict() | {"mpc": describe_mpc(stage.source)}
+    return stage.source.to_dict()
 
 
 def _list_numbers(values: np.ndarray) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from seaopt.control import ForceMPC, ScheduledController
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup import Band, BringUp, Stage
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
@@ -92,14 +93,17 @@ def _describe_stage(stage: Stage) -> Section:
     top = format_number(max(step.low), 3), format_number(max(step.high), 3)
     outputs = {} if controller.design is None else controller.see(controller.design[0]).outputs
     units = {controller.command.input: controller.command.unit, **outputs}
+    source, code = stage.source, "force_mpc.c" if isinstance(stage.source, ForceMPC) else "force_law.c"
+    held = f"Keep {source.over} at {format_number(stage.place)}." if isinstance(source, ScheduledController) else ""
+    ring = "" if isinstance(source, ForceMPC) else f" ({stage.name}/force_law_log.c does)"
     sentences = [
+        *([held] if held else []),
         *([f"{stage.note[0].upper()}{stage.note[1:]}."] if stage.note else []),
-        f"Flash {stage.name}/force_law.c, play {stage.name}/reference.csv (or reference.c): it fades in over "
+        f"Flash {stage.name}/{code}, play {stage.name}/reference.csv (or reference.c): it fades in over "
         f"{format_number(period, 3)} s, then {format_count(len(excitation.waves), 'set')} of phases of "
         f"{excitation.periods} periods of {format_number(period, 3)} s, {f.size} lines from {format_number(f[0], 3)} "
         f"to {format_number(f[-1], 3)} Hz, then it fades out.",
-        f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)} "
-        f"({stage.name}/force_law_log.c does).",
+        f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)}{ring}.",
         f"Expect: a step of the reference{_say_size(stage)} peaks at {' to '.join(dict.fromkeys(top))} of its size "
         f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
     ]

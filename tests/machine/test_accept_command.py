@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import seaopt as so
 from seaopt.cli.main import app
-from seaopt.cli.session import Session
 from tests.c_code import CompiledLog
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
@@ -108,15 +106,6 @@ def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
     content = json.loads((folder / "out" / "acceptance.json").read_text())
     assert [row["met"] for row in content["replay"]["logs"]] == [True, False]
     assert content["replay"]["logs"][1]["causes"][0]["kind"] == "factor"
-
-
-def test_bring_up_of_a_schedule_is_refused_with_what_to_do_in_python(folder, monkeypatch):
-    from typer.testing import CliRunner
-
-    schedule = SimpleNamespace(over="I_p", points=(0.2, 0.6))
-    monkeypatch.setattr(Session, "law", lambda session: schedule)
-    done = CliRunner().invoke(app, ["bringup", str(folder / "stand.toml"), "-o", str(folder / "out")])
-    assert "so.bring_up(schedule.at(0.2), ...)" in str(done.exception)
 
 
 SCHEDULED = PROBLEM.replace("9.0 }", '9.0, schedule = { over = "k", points = [5e5, 8e5] } }').replace("= 30", "= 25")

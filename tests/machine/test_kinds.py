@@ -129,3 +129,48 @@ def test_predictive_control_at_its_limits_is_replayed(planned):
     log = planned.log(Machine(), jump)
     (row,) = so.accept(planned.controller, [log]).replays
     assert row.met and row.saturated > 0.02 and row.largest < 1e-6
+
+
+def test_a_schedule_is_brought_up_with_less_effort_then_at_each_point(schedule, compiler, tmp_path):
+    from seaopt.machine.bringup_files import write_bring_up
+
+    certified = []
+
+    def certify(law):  # all of a schedule's certificate takes ten seconds
+        certified.append(law)
+        return so.certify(law.at(5e5), {"stand": STAND}, THOR, samples=5, simulations=False)
+
+    options = {"fractions": (0.5,), "limits": {"F1": 900.0}, "certify_stage": certify}
+    plan = so.bring_up(schedule, {"stand": STAND}, THOR, **options)
+    assert [(stage.name, stage.place) for stage in plan.stages] == [("stage_1", 5e5), ("full_1", 5e5), ("full_2", 8e5)]
+    first, _, last = plan.stages
+    assert first.controller.command_limit == 4.5 and last.controller.command_limit == 9.0
+    assert certified == [first.source, schedule] and "k" in last.channels
+    write_bring_up(plan, tmp_path)
+    assert (tmp_path / "full_2" / "force_law.c").is_file() and "Keep k at 8" in " ".join(str(plan).split())
+    bench = Bench(compiler, tmp_path / "bench", schedule)
+    reference = last.excitation.reference
+    stiff = replace(Machine(), stiffness=8e5)
+    log = bench.log(stiff, reference, places=np.full(reference.size, 8e5))
+    assert so.accept(schedule, [log]).met
+    assert np.max(np.abs(log["I"])) < last.stop["I"] and np.max(np.abs(log["F1"])) < last.stop["F1"]
+
+
+@pytest.mark.slow
+def test_predictive_control_is_brought_up_with_less_effort(planned, tmp_path):
+    from seaopt.machine.bringup_files import write_bring_up
+    from seaopt.robustness import linear_controller
+
+    mpc = planned.controller
+
+    def certify(law):  # all of a plan's certificate takes a minute
+        return so.certify(linear_controller(law), {"stand": STAND}, THOR, samples=5, simulations=False)
+
+    options = {"fractions": (0.5,), "limits": {"F1": 900.0}, "certify_stage": certify}
+    plan = so.bring_up(mpc, {"stand": STAND}, THOR, **options)
+    first, full = plan.stages
+    assert first.source.command_limit == 4.5 and full.source is mpc
+    write_bring_up(plan, tmp_path)
+    assert (tmp_path / "stage_1" / "force_mpc.h").is_file()
+    log = planned.log(Machine(), full.excitation.reference)
+    assert so.accept(mpc, [log]).replayed and np.max(np.abs(log["I"])) < full.stop["I"]
