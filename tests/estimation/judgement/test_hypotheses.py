@@ -184,6 +184,20 @@ def test_intervals_reach_to_what_is_neither_chance_nor_sure(first, gains, expect
     assert values == (expected and {"k": expected})
 
 
+def test_intervals_reach_to_what_is_named_beside_values_that_stay(monkeypatch):
+    """Unless it came to no minimum: then nobody knows where the values would go, and it is an error."""
+    monkeypatch.setattr("seaopt.estimation.judgement.causes.HALVED", 0.0)
+    monkeypatch.setattr("seaopt.estimation.judgement.causes.MOVED_SHARE", 1.0)
+    log = record(harder=0.05)
+    result = fit(log)
+    assert [(finding.kind, finding.severity) for finding in result.findings] == [("cause", "warning")]
+    for name in FREE:
+        parameter, there = result.parameters[name], result.hypotheses[0].parameters[name]
+        assert abs(there - parameter.value) <= 1.001 * parameter.total_std
+    monkeypatch.setattr("seaopt.estimation.judgement.hypothesis_search.LEFT", -1.0)
+    assert [error.kind for error in fit(log).errors] == ["cause"]
+
+
 def test_a_right_model_is_asked_nothing():
     result = fit(record())
     assert result.met
