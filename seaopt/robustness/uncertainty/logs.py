@@ -32,8 +32,8 @@ from seaopt.errors import SeaoptError
 from seaopt.estimation import Experiment, Fit
 from seaopt.estimation.result.findings import Nuisance
 from seaopt.formatting import format_number, join_words
-from seaopt.frequency.residual import ResidualResponse, measure_residual
-from seaopt.frequency.response import Lines
+from seaopt.frequency.residual import LENGTHS, ResidualResponse, measure_residual
+from seaopt.frequency.response import ComplexLines, Lines, find_band
 from seaopt.frequency.sampled import sampled_response
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import has_friction
@@ -47,7 +47,7 @@ SMOOTH = 5  # lines of which the median disc decides whether one tells
 FEWEST_LINES = 8
 PERIODS = 120.0  # of the bandwidth in the longest window
 HIGHEST = 0.5  # of the Nyquist frequency of log and law: above, folding is no longer small
-ABOUT = 0.5, 1.5  # of the crossover, from below which to above which lines must lie to confirm
+ABOUT = 0.5, 1.25  # of the crossover, and of where Ms is predicted too: from where to where lines must confirm
 Samples = Literal["fitted", "held out", "validate"]
 Outcome = Literal["confirmed", "refuted", "undecided"]
 
@@ -59,10 +59,10 @@ class LogVerdict:
     experiment: str
     samples: Samples
     outcome: Outcome
-    band_hz: tuple[float, float]  # in which the log can tell
-    ms: OrInfinite  # the largest in the band; infinite where the loop is unstable
-    ms_hz: float  # where it is largest, or surest
-    ms_least: OrInfinite  # what the log leaves at least, of what contradicts the model
+    band_hz: tuple[float, float]  # in which the log can tell, or confirms
+    ms: OrInfinite  # at the line that says most; infinite where the loop is unstable
+    ms_hz: float  # that line
+    ms_least: OrInfinite  # what the log leaves there at least
     ms_predicted: float  # at `ms_hz`
     confidence: float | None  # of a refutation, or a confirmation; None of samples that were fitted
     amplitude: float  # rms of the input, in `unit`
@@ -133,7 +133,7 @@ def _list_records(fit: Fit, experiment: Experiment, controller: Controller) -> I
         yield replace(whole, samples="held out", rows=slice(n - int(fit.holdout * n), n))
 
 
-def _measure(controller: Controller, part: _Record) -> ResidualResponse | None:
+def _measure(controller: Controller, part: _Record) -> list[ResidualResponse]:
     """Return the response of a record, up to where a law's loop can be told from it."""
     log, command = part.experiment.log, log_input(controller, part)
     good = np.isfinite(command) & np.all(np.isfinite(part.model) & np.isfinite(part.error), axis=0)
@@ -144,7 +144,7 @@ def _measure(controller: Controller, part: _Record) -> ResidualResponse | None:
         joined[rows.start] = False  # no run goes over a gap
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (good & joined).astype(int), [0]]))).reshape(-1, 2)
     if not np.any(good) or np.ptp(command[good]) == 0.0:
-        return None
+        return []
     return measure_residual(
         command,
         part.model,
@@ -184,57 +184,103 @@ def _find_base(controller: Controller, params: ParameterSet, part: _Record, f: L
     return sampled_response(model, np.zeros(0), clock, f, source)[0].T
 
 
-def _judge(controller: Controller, params: ParameterSet, part: _Record, limit: float) -> LogVerdict | None:
-    """Return what a record says of a law; None where it says nothing."""
+@record(eq=False)
+class _Lines:
+    """The lines of windows of one length at which a log can tell of a loop."""
+
+    f: Lines
+    loop: ComplexLines  # L as the model has it
+    error: ComplexLines  # of it
+    std: Lines
+    unseen: Lines
+    radius: Lines  # at the risk of a refutation
+    freedom: float
+    gapless: bool
+
+    @property
+    def predicted(self) -> Lines:
+        """The distance of the model's loop from -1."""
+        return np.abs(1.0 + self.loop)
+
+    @property
+    def measured(self) -> Lines:
+        """That of the log."""
+        return np.abs(1.0 + self.loop + self.error)
+
+
+def _tell(
+    controller: Controller, params: ParameterSet, part: _Record, response: ResidualResponse, alpha: float
+) -> _Lines | None:
+    """Return the lines at which a response can tell of the loop; None where they are too few."""
     from scipy.ndimage import median_filter  # deferred: 0.2 s
 
-    response = _measure(controller, part)
-    if response is None:
-        return None
-    f, plant = response.frequency_hz, part.experiment.plant
-    dry = has_friction(plant, part.experiment.apply_own(params))
+    f = response.frequency_hz
     c = _weigh(controller, part, f)
     loop, error, std, unseen = response.read(c)
+    dry = _is_dry(params, part)
     if not dry:
         loop = np.sum(c * _find_base(controller, params, part, f), axis=0)
-    predicted, measured = np.abs(1.0 + loop), np.abs(1.0 + loop + error)
-    radius = std * response.widen(REFUTE / response.lines) + unseen
-    size = np.maximum(predicted, measured)
+    radius = std * response.widen(alpha) + unseen
+    size = np.maximum(np.abs(1.0 + loop), np.abs(1.0 + loop + error))
     told = median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC
+    if dry:  # what transients and friction make of the model's own response is no loop gain
+        rough = np.sum(np.abs(c) * np.sqrt(response.rough), axis=0) * response.widen(CONFIRM)
+        told &= median_filter(rough / size, SMOOTH, mode="nearest") < LARGEST_DISC
     if np.count_nonzero(told) < FEWEST_LINES:
         return None
     first, last = np.flatnonzero(told)[[0, -1]]
-    gapless = bool(np.all(told[first:last]))
-    f, loop, error, std, unseen, predicted, measured, radius, windows = (
-        x[told] for x in (f, loop, error, std, unseen, predicted, measured, radius, response.windows)
+    lines = (x[told] for x in (f, loop, error, std, unseen, radius))
+    names = ("f", "loop", "error", "std", "unseen", "radius")
+    return _Lines(
+        **dict(zip(names, lines, strict=True)), freedom=response.freedom, gapless=bool(np.all(told[first:last]))
     )
-    low = 1.0 / (measured + radius)
-    counts = (predicted >= 1.0 / limit) | (measured + radius < predicted)
-    at = int(np.argmax(np.where(counts, low, 0.0)))
-    least, ms = float(np.max(low[counts], initial=0.0)), float(1.0 / np.min(measured))
-    turned = gapless and _is_turned(1.0 + loop, error, radius)
-    if turned:
-        at, least, ms = int(np.argmin(measured)), np.inf, np.inf
-    refuted = least > limit
-    at = at if refuted else int(np.argmin(measured))
-    independent = part.samples != "fitted"
-    confirmed = independent and gapless and not refuted and _covers(controller, f)
-    confirmed = confirmed and _keeps(limit, measured, std, unseen, windows)
+
+
+def _is_dry(params: ParameterSet, part: _Record) -> bool:
+    return has_friction(part.experiment.plant, part.experiment.apply_own(params))
+
+
+def _judge(controller: Controller, params: ParameterSet, part: _Record, limit: float) -> LogVerdict | None:
+    """Return what a record says of a law; None where it says nothing."""
+    responses = _measure(controller, part)
+    alpha = REFUTE / max(sum(response.frequency_hz.size for response in responses), 1)
+    told = [_tell(controller, params, part, response, alpha) for response in responses]
+    kinds = [lines for lines in told if lines is not None]
+    if not kinds:
+        return None
+    surest = max(kinds, key=lambda lines: _bound_ms(lines, limit)[0])
+    least, at = _bound_ms(surest, limit)
+    refuted, independent = least > limit, part.samples != "fitted"
+    low, high = min(lines.f[0] for lines in kinds), max(lines.f[-1] for lines in kinds)
+    confirmed = [] if refuted or not independent else [_confirm(controller, lines, limit) for lines in kinds]
+    confirmed = [band for band in confirmed if band is not None]
     outcome: Outcome = "refuted" if refuted else "confirmed" if confirmed else "undecided"
     return LogVerdict(
         experiment=part.experiment.name,
         samples=part.samples,
         outcome=outcome,
-        band_hz=(float(f[0]), float(f[-1])),
-        ms=ms if not refuted or turned else float(1.0 / measured[at]),
-        ms_hz=float(f[at]),
+        band_hz=max(confirmed, key=lambda band: band[1] / band[0]) if confirmed else (float(low), float(high)),
+        ms=np.inf if np.isinf(least) else float(1.0 / surest.measured[at]),
+        ms_hz=float(surest.f[at]),
         ms_least=least,
-        ms_predicted=float(1.0 / predicted[at]),
+        ms_predicted=float(1.0 / surest.predicted[at]),
         confidence=None if not independent else 1.0 - (REFUTE if refuted else CONFIRM),
         amplitude=float(np.nanstd(log_input(controller, part)[part.rows])),
         unit=controller.command.unit,
-        at_amplitude=dry,
+        at_amplitude=_is_dry(params, part),
     )
+
+
+def _bound_ms(lines: _Lines, limit: float) -> tuple[float, int]:
+    """Return what Ms is at least by what the model does not predict, and at which line; infinite of a loop that turns
+    about -1 otherwise than the model's.
+    """
+    most = lines.measured + lines.radius
+    low = np.where((lines.predicted >= 1.0 / limit) | (most < lines.predicted), 1.0 / most, 0.0)
+    at = int(np.argmax(low))
+    if lines.gapless and _is_turned(1.0 + lines.loop, lines.error, lines.radius):
+        return np.inf, int(np.argmin(lines.measured))
+    return float(low[at]), at
 
 
 def _is_turned(model: Any, error: Any, radius: Any) -> bool:
@@ -246,15 +292,16 @@ def _is_turned(model: Any, error: Any, radius: Any) -> bool:
     return bool(all(ends) and known and abs(np.sum(steps)) > np.pi)
 
 
-def _covers(controller: Controller, f: Lines) -> bool:
-    """Tell whether lines lie about the crossover."""
-    middle = controller.achieved.crossover_hz or controller.spec.bandwidth_hz
-    return bool(f[0] <= ABOUT[0] * middle and f[-1] >= ABOUT[1] * middle)
-
-
-def _keeps(limit: float, measured: Lines, std: Lines, unseen: Lines, windows: Lines) -> bool:
-    """Tell whether every line keeps the limit of Ms, the error of each along a radius at its confidence."""
+def _confirm(controller: Controller, lines: _Lines, limit: float) -> tuple[float, float] | None:
+    """Return the band in which every line keeps the limit, the error of each along a radius; None where it does not lie
+    about the crossover and the largest sensitivity that is predicted.
+    """
     from scipy.special import stdtrit  # deferred: 0.1 s
 
-    x = std * stdtrit(2.0 * windows - 2.0, 1.0 - CONFIRM) / np.sqrt(2.0) + unseen
-    return bool(np.all(measured - x - 0.5 * limit * x**2 >= 1.0 / limit))
+    x = lines.std * stdtrit(2.0 * lines.freedom, 1.0 - CONFIRM / LENGTHS) / np.sqrt(2.0) + lines.unseen
+    kept = lines.measured - x - 0.5 * limit * x**2 >= 1.0 / limit
+    f = lines.f[find_band(lines.f, kept)]
+    middle = controller.achieved.crossover_hz or controller.spec.bandwidth_hz
+    highest = max(middle, float(lines.f[np.argmin(lines.predicted)]))
+    covers = lines.gapless and f.size and f[0] <= ABOUT[0] * middle and f[-1] >= ABOUT[1] * highest
+    return (float(f[0]), float(f[-1])) if covers else None

@@ -99,7 +99,7 @@ def test_mode_that_the_model_lacks_fails_by_the_name_of_the_log(stand, thor, fit
     (verdict,) = certificate.logs
     assert not row.met and not certificate.met
     assert row.plant == "log:chirp1" and row.limit == pytest.approx(1.6 * (1 + GRACE))
-    assert verdict.outcome == "refuted" and 38.0 < verdict.ms_hz < 44.0
+    assert verdict.outcome == "refuted" and 38.0 < verdict.ms_hz < 46.0
     assert "chirp1: measured Ms" in row.where and "predicted" in row.where
     f = np.linspace(38.0, 46.0, 2000)
     peak = np.max(sensitivity(controller, thor, 0.05, f))
@@ -205,11 +205,11 @@ def test_discs_of_what_a_model_leaves_hold_the_truth_as_often_as_stated():
     for _ in range(20):
         u = rng.normal(size=n)
         error = 0.1 * scipy.signal.lfilter(b, a, u) + rng.normal(scale=0.5, size=n)
-        found = measure_residual(
+        for found in measure_residual(
             u, np.zeros((1, n)), error[None], period, [slice(0, 3000), slice(3001, n)], longest_s=0.25, highest_hz=200.0
-        )
-        _, truth = scipy.signal.freqz(b, a, found.frequency_hz, fs=1.0 / period)
-        _, centre, std, _ = found.read(np.ones((1, found.frequency_hz.size)))
-        outside += np.sum(np.abs(centre - 0.1 * truth) > std * found.widen(0.05))
-        lines += truth.size
+        ):
+            _, truth = scipy.signal.freqz(b, a, found.frequency_hz, fs=1.0 / period)
+            _, centre, std, _ = found.read(np.ones((1, found.frequency_hz.size), dtype=complex))
+            outside += np.sum(np.abs(centre - 0.1 * truth) > std * found.widen(0.05))
+            lines += truth.size
     assert outside / lines == pytest.approx(0.05, abs=0.015)
