@@ -74,9 +74,7 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
         lines += [
             "",
             "# No [controller]: these logs have no torque or force to regulate. From encoders on both sides of the",
-        ]
-        lines += [
-            '# spring firmware makes one: parts = ["deflection_sensor"], measured = "tau_d", or "F_d" of a screw.'
+            '# spring firmware makes one: parts = ["deflection_sensor"], measured = "tau_d", or "F_d" of a screw.',
         ]
     if guessed := interview.list_guessed():
         head += [
