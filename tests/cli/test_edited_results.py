@@ -148,16 +148,21 @@ def change_problem(content, other):
     content["made_from"]["problem"] = "0" * 64
 
 
-EDITS = [
+OF_WHAT_IS_MET = [
     set_met, delete_row, empty_rows, raise_limit, raise_limit_and_set_met, lower_value, turn_sense, set_passed,
-    change_draws, change_failures, change_seed, rename_plant, change_worst, add_key, set_fit_met, delete_digest,
-    delete_made_from, empty_made_from, take_other_digest, forget_controller, take_other_controller, change_problem,
+    change_draws, change_failures, take_other_digest, take_other_controller,
+]  # fmt: skip
+OF_EITHER = [
+    change_seed, rename_plant, change_worst, add_key, set_fit_met, delete_digest, delete_made_from, empty_made_from,
+    forget_controller, change_problem,
+]  # fmt: skip
+EDITS = [
+    *((edit, state) for edit in OF_WHAT_IS_MET for state in ("met", "failed")), *((edit, "met") for edit in OF_EITHER)
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("state", ["met", "failed"])
-@pytest.mark.parametrize("edit", EDITS, ids=lambda edit: edit.__name__)
-def test_an_edited_certificate_certifies_nothing(certified, tmp_path, capsys, state, edit):
+@pytest.mark.parametrize(("edit", "state"), EDITS, ids=lambda item: getattr(item, "__name__", item))
+def test_an_edited_certificate_certifies_nothing(certified, tmp_path, capsys, edit, state):
     """Neither for `export`, nor for `report`, nor where Python reads it."""
     folder = shutil.copytree(certified[state], tmp_path / "copy")
     path, others = folder / "out" / "robustness.json", certified["failed" if state == "met" else "met"] / "out"
