@@ -1,10 +1,9 @@
-"""Certificates without some of their checks, and fits without the search for causes, which take most of the time."""
+"""Certificates without some of their checks, which take most of the time."""
 
 from __future__ import annotations
 
 import pytest
 
-from seaopt.estimation.judgement.hypothesis_search import Search
 from seaopt.robustness.certificate import certify
 from seaopt.robustness.certificate.cases import Check
 
@@ -12,9 +11,3 @@ from seaopt.robustness.certificate.cases import Check
 def leave_out(patch: pytest.MonkeyPatch, *checks: Check) -> None:
     """Let certificates have none of these checks."""
     patch.setattr(certify, "CHECKS", tuple(check for check in certify.CHECKS if check not in checks))
-
-
-def leave_out_causes(patch: pytest.MonkeyPatch) -> None:
-    """Let fits look for nothing that explains a misfit better: most of such a fit's time, and no std depends on it."""
-    patch.setattr("seaopt.estimation.judgement.judge.find_causes", lambda *_, **__: [])
-    patch.setattr("seaopt.estimation.judgement.judge.search_hypotheses", lambda *_, **__: Search())

@@ -1,20 +1,22 @@
 """Shared fixtures. Array shapes and types of seaopt are checked while the tests run (jaxtyping and beartype).
 
-A check of one call costs more than most functions here: see `check_calls`. SEAOPT_TYPES=0 leaves all out.
+A check of one call costs about 0.1 ms, more than most functions here: see `check_calls`. SEAOPT_TYPES=0 leaves all out.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import gc
 import inspect
 import os
 import sys
 import tempfile
+from collections import defaultdict
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType, SimpleNamespace
+from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any, Literal, get_type_hints
 
 os.environ.setdefault("SEAOPT_CACHE_DIR", tempfile.mkdtemp(prefix="seaopt-tests-"))
@@ -53,8 +55,9 @@ checker = ModuleType("seaopt_type_checker")
 checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=OVERRIDES))
 sys.modules["seaopt_type_checker"] = checker
 
-waiting: list[tuple[FunctionType, CodeType]] = []  # functions that were called, and code that checks a call
-checked_inside: set[int] = set()  # codes of functions defined inside functions, of which a first call was checked
+EVERY = 200
+numbers: dict[CodeType, int] = {}  # of functions: a hash of the code itself at every call takes longer than most calls
+calls: defaultdict[int, int] = defaultdict(int)
 
 
 def make_checked(function):
@@ -72,63 +75,31 @@ def resolve(hint, function):
         return Any
 
 
-@cache
-def compile_first(free: int) -> CodeType:
-    """Return code with so many free variables that calls "check", in whose place is what checks a call."""
-    names = "".join(f"free{number}, " for number in range(free))
-    text = f"""
-def outer({names}):
-    def first(*args, **kwargs):
-        check = "check"
-        return check(*args, **kwargs)
-        ({names})
-    return first
-"""
-    (outer,) = (const for const in compile(text, "first", "exec").co_consts if isinstance(const, CodeType))
-    return next(const for const in outer.co_consts if isinstance(const, CodeType))
-
-
 def check_calls(function):
-    """Check a function's first call in each test, and in its setup; a class's constructor's.
+    """Check a function's first call in each test, then one in `EVERY`; a class's constructor's.
 
-    Checking each call takes half of the tests' time, and a wrapper that counts them three times what most calls take.
-    So a function has code that checks a call, and its own from then on. What is defined inside a function counts as one
-    function.
+    Checking each call takes half of the tests' time. What is defined inside a function counts as one function.
     """
     if inspect.isclass(function):
         if dataclasses.is_dataclass(function) and "__init__" in vars(function):
-            check_calls(function.__init__)
+            function.__init__ = check_calls(function.__init__)
         return function
     if inspect.isgeneratorfunction(function):  # checked where it is first advanced, among somebody else's shapes
         return function
-    code, checked, inside = function.__code__, None, "<locals>" in function.__qualname__
-    if inside and id(code) in checked_inside:
-        return function
+    number, checked = numbers.setdefault(function.__code__, len(numbers)), None
 
-    def check(*args, **kwargs):
+    @functools.wraps(function)
+    def call(*args, **kwargs):
         nonlocal checked
-        function.__code__ = code
-        if inside:
-            checked_inside.add(id(code))
-        else:
-            waiting.append((function, arming))
+        calls[number] = count = calls[number] + 1
+        if count > 1 and count % EVERY:
+            return function(*args, **kwargs)
         if checked is None:
-            checked = make_checked(plain)
+            checked = make_checked(function)
         with shapes_of_one_call():
             return checked(*args, **kwargs)
 
-    plain = FunctionType(code, function.__globals__, function.__name__, function.__defaults__, function.__closure__)
-    plain.__kwdefaults__, plain.__annotations__ = function.__kwdefaults__, function.__annotations__
-    plain.__qualname__, plain.__module__, plain.__doc__ = function.__qualname__, function.__module__, function.__doc__
-    function.__wrapped__ = plain  # which has its signature, and the hints that a decorator may yet replace
-    first = compile_first(len(code.co_freevars))
-    arming = first.replace(
-        co_consts=tuple(check if const == "check" else const for const in first.co_consts),
-        co_freevars=code.co_freevars, co_name=code.co_name, co_qualname=code.co_qualname,
-        co_filename=code.co_filename, co_firstlineno=code.co_firstlineno,
-    )  # fmt: skip
-    function.__code__ = arming
-    return function
+    return call
 
 
 def pytest_collection_finish() -> None:
@@ -136,22 +107,9 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-def check_next_calls() -> None:
-    """Have the next call of each function checked."""
-    for function, arming in waiting:
-        function.__code__ = arming
-    waiting.clear()
-    checked_inside.clear()
-
-
 def pytest_runtest_setup() -> None:
-    """Check calls anew, so that what a test checks does not depend on the tests before it."""
-    check_next_calls()
-
-
-def pytest_runtest_call() -> None:
-    """Check what fixtures called again."""
-    check_next_calls()
+    """Count calls anew, so that what a test checks does not depend on the tests before it."""
+    calls.clear()
 
 
 shapes_of_one_call = partial(jaxtyping.jaxtyped, "context")
@@ -161,9 +119,9 @@ if os.environ.get("SEAOPT_TYPES") != "0":  # long tests make calls that the quic
 
 import seaopt as so  # noqa: E402
 from seaopt.bench import PAPER_STAND  # noqa: E402
+from seaopt.estimation.judgement.hypothesis_search import Search  # noqa: E402
 from seaopt.simulation.native import find_compiler  # noqa: E402
 from tests import simulated_logs  # noqa: E402
-from tests.checks import leave_out_causes  # noqa: E402
 
 settings.register_profile("seaopt", deadline=None, max_examples=25, derandomize=True)
 settings.load_profile("seaopt")
@@ -252,8 +210,9 @@ def short_log(stand, thor) -> so.Log:
 
 @pytest.fixture
 def without_causes(monkeypatch):
-    """Let fits look for nothing that explains a misfit better."""
-    leave_out_causes(monkeypatch)
+    """Let fits look for nothing that explains a misfit better: most of such a fit's time, and no std depends on it."""
+    monkeypatch.setattr("seaopt.estimation.judgement.judge.find_causes", lambda *_, **__: [])
+    monkeypatch.setattr("seaopt.estimation.judgement.judge.search_hypotheses", lambda *_, **__: Search())
 
 
 @pytest.fixture

@@ -54,7 +54,6 @@ the ground with :math:`-F_1 = -J \ddot\theta - \tau_s`, which the lumped drive m
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from operator import is_
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -301,22 +300,12 @@ def make_plant(
     frictions = _list_frictions(actuator, states, [parameter.name for parameter in parameters])
     bristled = [friction for friction in frictions.values() if friction.bristles is not None]
 
-    solved: list[tuple[list[str], list[Any], EquationsOfMotion]] = []
-
-    def solve(x: Any, u: Any, p: Any) -> EquationsOfMotion:
-        """Once for f and h, which a plant gives the same symbols: it takes most of the time that a plant is made in."""
-        names, symbols = [*vars(x), *vars(u), *vars(p)], [*vars(x).values(), *vars(u).values(), *vars(p).values()]
-        last = solved[-1:]
-        if not last or last[0][0] != names or not all(map(is_, last[0][1], symbols)):
-            last = solved[:] = [(names, symbols, solve_motion(actuator, x, u, p))]
-        return last[0][2]
-
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         slips = {_get_bristles(friction).state: friction.find_rate(x, u, p) for friction in bristled}
-        return {**solve(x, u, p).rates, **slips}
+        return {**solve_motion(actuator, x, u, p).rates, **slips}
 
     def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        motion = solve(x, u, p)
+        motion = solve_motion(actuator, x, u, p)
         return {output: read(motion, x) for output, (_, read) in outputs.items()}
 
     def energy(x: Any, p: Any) -> Any:

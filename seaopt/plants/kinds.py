@@ -37,7 +37,16 @@ def plant_of_kind(kind: str, *, sticks: Any = False, **options: Any) -> Plant:
     PlantError
         The kind or one of its options is unknown, or an installed package's entry point fails.
     """
-    make = KINDS.get(kind) or _load_kind(kind)
+    installed = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+    if kind not in KINDS and kind not in installed:
+        raise PlantError(f'kind = "{kind}" is not a plant; {suggestion(kind, [*KINDS, *installed])}')
+    if kind in KINDS:
+        make = KINDS[kind]
+    else:
+        try:
+            make = installed[kind].load()
+        except Exception as error:
+            raise PlantError(f'kind = "{kind}" cannot be loaded from {installed[kind].value}: {error}') from error
     accepted = list(inspect.signature(make).parameters)
     for name in options:
         if name not in accepted:
@@ -46,16 +55,6 @@ def plant_of_kind(kind: str, *, sticks: Any = False, **options: Any) -> Plant:
         raise PlantError(f"sticks = {sticks!r} is not true or false; give one of them")
     plant = make(**options)
     return let_stick(plant) if sticks else plant
-
-
-def _load_kind(kind: str) -> Callable[..., Plant]:
-    installed = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
-    if kind not in installed:
-        raise PlantError(f'kind = "{kind}" is not a plant; {suggestion(kind, [*KINDS, *installed])}')
-    try:
-        return installed[kind].load()
-    except Exception as error:
-        raise PlantError(f'kind = "{kind}" cannot be loaded from {installed[kind].value}: {error}') from error
 
 
 def known_parameters(*, rotary_first: bool = False) -> dict[str, Parameter]:

@@ -107,7 +107,7 @@ def _is_private(path: Path) -> bool:
     return only_users and not stat.S_ISLNK(status.st_mode)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def load_library(source: str, name: str) -> ctypes.CDLL | None:
     """Return the library of a C source that exports `name`, compiled or cached. None without compiler or folder."""
     compiler, folder = find_compiler(), cache_folder()

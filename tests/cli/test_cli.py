@@ -46,9 +46,6 @@ def test_certify_simulates_and_looks_at_the_port(done):
     assert content["simulation"]["passed"]
     assert content["simulation"]["sensors"]["noise_std"] == {"F1": 2.0}
     assert {row["draw"] for row in content["simulation"]["rows"]} == {"nominal", "1"}
-    rows = [row for row in content["requirements"] if row["scenario"]]
-    assert {(row["plant"], row["name"]) for row in rows} == {("stand", "step_overshoot"), ("stand", "step_settling_s")}
-    assert all(row["met"] and 0.0 < row["value"] < row["limit"] and row["draw"]["number"] for row in rows)
     assert content["passivity"]["environments"]["fixed_stable"]
     assert "34 runs passed" in done.stdout and "swing tracks references between" in done.stdout
 

@@ -56,16 +56,16 @@ def find_ripple(
     gain = _respond(experiment.data.plant, params, experiment.data.outputs, experiment.period, position.size)
     gain = gain / size[:, None]
 
-    power, weights, along = np.sum(np.abs(residual) ** 2, axis=1), np.abs(gain.T) ** 2, gain.T * np.conj(residual.T)
-
     def weigh(wave: float) -> tuple[float, float, float]:
         """Return the share of an output's power that a wave number accounts for, and both amplitudes."""
         slow = moved * wave < 2.0 * np.pi * TURNS
-        sine, cosine = load_fft().rfft(np.stack([np.sin(wave * position), np.cos(wave * position)]) * slow)
-        squares = np.stack([np.abs(sine) ** 2, np.real(sine * np.conj(cosine)), np.abs(cosine) ** 2]) @ weights
-        gram, right = squares[[[0, 1], [1, 2]]], np.real(np.stack([sine, cosine]) @ along)  # of each output, the last
-        amplitudes = np.linalg.lstsq(gram.sum(axis=2), right.sum(axis=1), rcond=1e-9)[0]
-        share = (2.0 * amplitudes @ right - np.einsum("i,ijo,j->o", amplitudes, gram, amplitudes)) / power
+        turned = load_fft().rfft(np.stack([np.sin(wave * position), np.cos(wave * position)]) * slow)
+        columns = gain[:, None, :] * turned
+        gram = np.sum(np.real(columns[:, :, None, :] * np.conj(columns[:, None, :, :])), axis=(0, 3))
+        right = np.sum(np.real(columns * np.conj(residual[:, None, :])), axis=(0, 2))
+        amplitudes = np.linalg.lstsq(gram, right, rcond=1e-9)[0]
+        rest = residual - np.einsum("c,ocf->of", amplitudes, columns)
+        share = 1.0 - np.sum(np.abs(rest) ** 2, axis=1) / np.sum(np.abs(residual) ** 2, axis=1)
         return float(np.max(share)), float(amplitudes[0]), float(amplitudes[1])
 
     best = max(np.arange(2.0 * step, top, step), key=lambda wave: weigh(wave)[0], default=0.0)

@@ -206,11 +206,15 @@ class FitExperiment:
 
     def normal(self, passes: Sequence[Pass], n: int) -> Float[np.ndarray, "n1 n1"]:
         """Return the normal matrix of [residual, n unknowns], in sigma, of the passes of every segment."""
-        total = np.zeros((1 + n,) * 2)
+        total = np.zeros((1 + n, 1 + n))
+        self.add_normal(total, passes)
+        return total
+
+    def add_normal(self, normal: Float[np.ndarray, "n1 n1"], passes: Sequence[Pass]) -> None:
+        """Add it in place: a matrix for each of many logs would take more than their passes."""
         for segment, sums in zip(self.segments, passes, strict=True):
             for o, places in enumerate(self.columns(segment)):
-                add_gram(total, sums.gram[o] / self.sigma[o] ** 2, places)
-        return total
+                add_gram(normal, sums.gram[o] / self.sigma[o] ** 2, places)
 
     def cost(self, passes: Sequence[Pass]) -> float:
         """Return the loss of the passes of every segment, in sigma."""

@@ -176,13 +176,14 @@ class FitProblem:
         """
         z, n, unknowns = passes.z, passes.z.size, self.unknowns
         cost, gradient, hessian = unknowns.prior(z)
+        normal = np.zeros((1 + n, 1 + n))
         for experiment in self.experiments:
             row = passes.by_experiment[experiment.name]
-            normal = experiment.normal(row, n)
-            gradient, hessian = gradient + normal[0, 1:], hessian + normal[1:, 1:]
+            experiment.add_normal(normal, row)
             cost += experiment.cost(row)
-            noise = [slot.index for slot in experiment.slots.noise if slot.index is not None]
-            hessian[noise, noise] += 2.0 * np.abs(normal[0, 1:][noise])  # see above
+        gradient, hessian = gradient + normal[0, 1:], hessian + normal[1:, 1:]
+        noise = [slot.index for e in self.experiments for slot in e.slots.noise if slot.index is not None]
+        hessian[noise, noise] += 2.0 * np.abs(normal[0, 1:][noise])  # see above; each is of one experiment
         finite = np.isfinite(cost) and np.all(np.isfinite(gradient)) and np.all(np.isfinite(hessian))
         linear = unknowns.linear if self.exactly_linear else np.zeros(n, dtype=bool)
         moved = np.zeros(n) if to is None else to - z

@@ -122,7 +122,14 @@ def compute_meat(
     for experiment in problem.experiments:
         sums = statistics[experiment.name]
         r, last = estimate_correlations(sums)
-        meat, together = _sum_twice(experiment, z, inverse, r)
+        places = np.concatenate([at for segment in experiment.segments for at in experiment.columns(segment)])
+        seen = np.unique(places[places >= 0])
+        if seen.size < p:  # one of many logs: its few unknowns move all that is asked for
+            basis = np.zeros((len(inverse), seen.size))
+            basis[seen, np.arange(seen.size)] = 1.0
+            meat, together = inverse[seen].T @ _sum_twice(experiment, z, basis, r) @ inverse[seen]
+        else:
+            meat, together = _sum_twice(experiment, z, inverse, r)
         total += _at_least(meat, together) if np.max(sums.count) < SHORT_LOG and not last else meat
     return total
 

@@ -112,16 +112,12 @@ def test_a_fit_without_diagnostics_is_judged(stand, thor, log):
     assert preferred_delay(fit) == pytest.approx(2.5e-3, rel=0.01)
 
 
-@pytest.mark.usefixtures("without_causes")
-def test_a_missing_mode_is_found_with_its_frequency_whatever_parameter_is_named(thor):
-    """The screw mode of the defaults lies at 80 Hz (paper, Sec. IV-A); the bare model lacks it, and k or m_l take up
-    little of it, whatever their chi-square.
-    """
+def test_a_missing_mode_is_found_with_its_frequency(thor):
+    """The screw mode of the defaults lies at 80 Hz (paper, Sec. IV-A); the bare model lacks it."""
     true = so.plants.high_impedance(parts=("screw_mode",))
     log = so.virtual_log(true, thor, PAPER_STAND, duration_s=20, rate_hz=400, seed=3, sensors=NOISE)
-    found = diagnose(fitted(so.plants.high_impedance(), log, thor))
-    assert found.held["k"].chi2 > 100
-    (said,) = [s for s in found.sentences if s.startswith("stand.F2") and "a missing pole" in s]
+    sentences = diagnose(fitted(so.plants.high_impedance(), log, thor)).sentences
+    (said,) = [s for s in sentences if s.startswith("stand.F2") and "a missing pole" in s]
     assert 70 < float(said.split("below ")[1].split(" Hz")[0]) < 90
 
 
@@ -143,7 +139,6 @@ def test_a_delay_is_tried_where_the_input_is_joined_by_lines(stand, thor, log):
     assert preferred_delay(fit) == pytest.approx(2.5e-3 * 3.5, rel=0.01)
 
 
-@pytest.mark.usefixtures("without_causes")
 def test_a_disturbance_is_told_from_what_follows_the_input(stand, thor, log):
     """Slow noise on the force, independent of the current: coloured, predictable, and followed by nothing."""
     slow = 60.0 * np.sqrt(1 - 0.99**2) * ar1(0.99, len(log), np.random.default_rng(2))
@@ -155,7 +150,6 @@ def test_a_disturbance_is_told_from_what_follows_the_input(stand, thor, log):
     assert item.one_step.used > item.free_run.used + 3
 
 
-@pytest.mark.usefixtures("without_causes")
 @pytest.mark.parametrize("method", [so.OutputError(), pytest.param(so.PredictionError(), marks=pytest.mark.slow)])
 def test_held_out_samples_are_predicted_one_step_ahead_too(stand, thor, log, method):
     slow = 60.0 * np.sqrt(1 - 0.99**2) * ar1(0.99, len(log), np.random.default_rng(2))
@@ -203,16 +197,12 @@ def test_shares_add_up_to_one(stand, swing, thor, log):
     assert all(0.0 <= share <= 1.0 for item in found.values() for share in item.parameters.values())
 
 
-@pytest.mark.usefixtures("without_causes")
-def test_a_bound_is_told(stand, thor, log):
+def test_a_bound_and_a_changed_plant_are_told(stand, thor, log):
     held = thor.update(eta=0.5).bound(eta=(0.0, 0.9)).free(*FREE)
     bench = so.Experiment(plant=stand, log=log, name="stand", outputs=("F1", "F2"))
     found = diagnose(so.fit([bench], held))
     assert found.at_bound == ("eta",)
     assert "eta" in [one.where for one in found.findings if one.kind == "bound"]
-
-
-def test_a_plant_that_changed_is_told(stand, thor, log):
     later = log["F1"].copy()
     later[-len(later) // 5 :] *= 1.2
     changed = so.Log.from_arrays(time=log.time, I=log["I"], F1=later, F2=log["F2"])

@@ -17,6 +17,8 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Noise
 from seaopt.errors import EstimationError, FileError
 from seaopt.estimation import Squares, profile
+from seaopt.estimation.problem.residual_statistics import compute_statistics
+from seaopt.estimation.result.covariance import compute_meat
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.files import to_json
 
@@ -112,6 +114,23 @@ def test_misra1a_values_and_standard_errors_are_nists():
     for name, (value, error) in MISRA.items():
         assert fit.parameters[name].value == pytest.approx(value, rel=1e-6)
         assert fit.white_covariance.std(name) * residual_dof == pytest.approx(error, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_causes")
+def test_intervals_cover_the_truth(stand, thor):
+    """95 % intervals of J, b_r, eta over 60 seeds (180 intervals)."""
+    inside = 0
+    for seed in range(60):
+        noise = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
+        log = so.virtual_log(
+            stand, thor, (Noise(std=1.0, band_hz=50),), duration_s=6, rate_hz=400, seed=seed, sensors=noise
+        )
+        fit = so.fit([experiment(stand, log)], thor.free(*FREE), method=so.OutputError(search=False))
+        for name in FREE:
+            low, high = fit.parameters[name].ci95
+            inside += low <= thor[name].value <= high
+    assert 0.89 <= inside / 180 <= 0.99
 
 
 @pytest.mark.slow
@@ -502,3 +521,22 @@ def test_it_is_quick(stand, stand_log, thor):
 def test_guesses_are_counted_and_named():
     assert state_guesses(["N_p", "l"]) == "on 2 guesses: N_p, l"
     assert state_guesses([]) == ""
+
+
+def test_the_meat_of_many_logs_is_that_of_each_direction_alone():
+    """With more directions than a log has unknowns the sum goes another way."""
+    plant, thor = so.plants.high_impedance(), so.plants.thor()
+    sensors = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
+    experiments = [
+        so.Experiment(
+            plant=plant, name=f"log{k}", outputs=("F1", "F2"),
+            log=so.virtual_log(plant, thor, PAPER_STAND, duration_s=15, rate_hz=400, seed=k, sensors=sensors),
+        )
+        for k in range(3)
+    ]  # fmt: skip
+    minimum = so.fit(experiments, thor.free("J", "b_r"), diagnostics=False).require_minimum("test")
+    statistics = compute_statistics(minimum.problem, minimum.z)
+    directions = np.random.default_rng(0).normal(size=(minimum.z.size, 9))
+    alone = [compute_meat(minimum.problem, minimum.z, column[:, None], statistics)[0, 0] for column in directions.T]
+    together = compute_meat(minimum.problem, minimum.z, directions, statistics)
+    np.testing.assert_allclose(np.diag(together), alone, rtol=1e-9)

@@ -410,16 +410,16 @@ def test_bad_options(make, words):
 
 
 def test_shots_too_short_for_the_states_are_refused():
-    """800 samples in 500 shots are 1.6 each: one state, an output, and nothing left for the parameters."""
-    time, u, y = lag_log(n=800)
+    """8000 samples in 5000 shots are 1.6 each: one state, an output, and nothing left for the parameters."""
+    time, u, y = lag_log(n=8000)
     log = so.Log.from_arrays(time=time, u=u, y=y)
     one = so.Experiment(plant=lag(), log=log, offset=False, name="lag")
-    words = r"experiment lag: {} leaves 1.6 samples per shot, of 800 .* at least 4 samples: give 200 or fewer"
-    with pytest.raises(EstimationError, match=words.format(r"MultipleShooting\(segments=500\)")):
-        so.fit([one], LAG, method=so.MultipleShooting(segments=500))
-    with pytest.raises(EstimationError, match=words.format("shots = 500")):
-        so.fit([replace(one, shots=500)], LAG)
-    fit = so.fit([one], LAG, method=so.MultipleShooting(segments=200), diagnostics=False)
+    words = r"experiment lag: {} leaves 1.6 samples per shot, of 8000 .* at least 4 samples: give 2000 or fewer"
+    with pytest.raises(EstimationError, match=words.format(r"MultipleShooting\(segments=5000\)")):
+        so.fit([one], LAG, method=so.MultipleShooting(segments=5000))
+    with pytest.raises(EstimationError, match=words.format("shots = 5000")):
+        so.fit([replace(one, shots=5000)], LAG)
+    fit = so.fit([one], LAG, method=so.MultipleShooting(segments=2000))
     assert fit.parameters["a"].value == pytest.approx(0.2, abs=4.5 * fit.parameters["a"].std)
     five = so.Plant(
         name="chain", states={f"x{i}": "N" for i in range(5)}, inputs={"u": "N"}, outputs={"y": "N"},
@@ -427,8 +427,8 @@ def test_shots_too_short_for_the_states_are_refused():
         f=lambda t, x, u, p: {f"x{i}": p.a * (u.u - getattr(x, f"x{i}")) for i in range(5)},
         h=lambda t, x, u, p: {"y": p.b * x.x4},
     )  # fmt: skip
-    with pytest.raises(EstimationError, match="starts from 5 unknown states and needs at least 6 samples: give 133"):
-        so.fit([replace(one, plant=five)], LAG, method=so.MultipleShooting(segments=200))
+    with pytest.raises(EstimationError, match="starts from 5 unknown states and needs at least 6 samples: give 1333"):
+        so.fit([replace(one, plant=five)], LAG, method=so.MultipleShooting(segments=2000))
 
 
 def flat():

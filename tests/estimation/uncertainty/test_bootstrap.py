@@ -14,7 +14,6 @@ from seaopt.errors import EstimationError
 from seaopt.estimation import bootstrap
 from seaopt.estimation.uncertainty.bootstrap import estimate_block_length
 from seaopt.executors import Processes
-from tests.checks import leave_out_causes
 
 FREE = ("J", "b_r", "eta")
 DRAWS = 400
@@ -26,14 +25,13 @@ def coloured(a, n, seed, columns=1):
     return lfilter([np.sqrt(1 - a * a)], [1, -a], white, axis=0)[500:]
 
 
-def stand_fit(stand, thor, a):
+def stand_fit(stand, thor, a, **options):
     log = so.virtual_log(stand, thor, PAPER_STAND, duration_s=60, rate_hz=400, seed=3)
     noise = 5.0 * coloured(a, len(log), 1, 2)
     log = so.Log.from_arrays(time=log.time, I=log["I"], F1=log["F1"] + noise[:, 0], F2=log["F2"] + noise[:, 1])
-    bench = so.Experiment(plant=stand, log=log, name="stand", outputs=("F1", "F2"))
-    with pytest.MonkeyPatch.context() as patch:
-        leave_out_causes(patch)
-        return so.fit([bench], thor.free(*FREE))
+    return so.fit(
+        [so.Experiment(plant=stand, log=log, name="stand", outputs=("F1", "F2"))], thor.free(*FREE), **options
+    )
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +76,7 @@ def test_a_step_is_a_refit_where_noise_is_small(noisy):
     "make", [lambda: ThreadPoolExecutor(3), pytest.param(lambda: Processes(2), marks=pytest.mark.slow)]
 )
 def test_refits_are_the_same_bit_for_bit_wherever_they_are_made(stand, thor, short_log, make):
-    fit = so.fit(
-        [so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], thor.free("J", "b_r"), diagnostics=False
-    )
+    fit = so.fit([so.Experiment(plant=stand, log=short_log, outputs=("F1", "F2"))], thor.free("J", "b_r"))
     here = bootstrap(fit, 20, refit=True)
     with make() as executor:
         there = bootstrap(fit, 20, refit=True, executor=executor)
@@ -119,6 +115,6 @@ def test_bad_arguments_say_what_to_do(noisy, stand, thor, short_log):
         bootstrap(noisy, block=0)
     bench = so.Experiment(plant=stand, log=short_log, outputs=("F1",))
     with pytest.raises(EstimationError, match="enter only together"):
-        bootstrap(so.fit([bench], thor.free("K_tau", "eta"), diagnostics=False))
+        bootstrap(so.fit([bench], thor.free("K_tau", "eta")))
     with pytest.raises(EstimationError, match="errors of prediction"):
-        bootstrap(so.fit([bench], thor.free("J"), method=so.PredictionError(), diagnostics=False), refit=True)
+        bootstrap(so.fit([bench], thor.free("J"), method=so.PredictionError()), refit=True)
