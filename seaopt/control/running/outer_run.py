@@ -7,6 +7,8 @@ the force law it gives a law of the reference x_0 and of the link's position bes
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from seaopt.control.laws.controller import Controller
@@ -36,15 +38,18 @@ def enclose_law(law: Law, outer: OuterLoop, place: int | None = None) -> Law:
 
 
 def enclose(controller: Controller, plant: Plant) -> tuple[Law, tuple[str, ...]]:
-    """Return the law of a controller, with its outer loop on a plant whose link moves, and the outputs it reads. One
-    without stiffness is left out, as in the law that runs: it leaves the link where it is.
-    """
+    """Return the law of a controller, with its outer loop on a plant whose link moves, and the outputs it reads."""
     signals, outer = controller.signals, controller.outer
-    if outer is None or not controller.renders or outer.position not in plant.outputs:
+    if outer is None or outer.position not in plant.outputs:
         return controller.law, signals
     if outer.position in signals:
         return enclose_law(controller.law, outer, signals.index(outer.position)), signals
     return enclose_law(controller.law, outer), (*signals, outer.position)
+
+
+def enclose_running(controller: Controller, plant: Plant) -> tuple[Law, tuple[str, ...]]:
+    """Return the same of the law that runs in scenarios, which has no outer loop without stiffness."""
+    return enclose(controller if controller.renders else replace(controller, outer=None), plant)
 
 
 def close(controller: Controller, plant: Plant, params: ParameterSet, enclosed: tuple[Law, tuple[str, ...]]) -> Loop:

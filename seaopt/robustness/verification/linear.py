@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from seaopt.control.loops.loop import STABLE, Loop
-from seaopt.control.running.outer_run import close, enclose
+from seaopt.control.running.outer_run import close, enclose_running
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -76,7 +76,7 @@ def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) 
 def view_loop(stage: Stage, plant: Plant, params: ParameterSet) -> LinearView:
     """Return the linear loop on a plant at rest, with the noise of a stage's devices."""
     controller = stage.controller
-    enclosed = enclose(controller, plant)
+    enclosed = enclose_running(controller, plant)
     return LinearView(
         loop=close(controller, plant, params, enclosed),
         noise=tuple(_combine_std(*stage.find_errors(name)) for name in enclosed[1]),

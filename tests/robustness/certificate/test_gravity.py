@@ -43,6 +43,17 @@ def test_eigenvalue_is_that_of_the_link_under_what_is_left_of_its_weight(plain):
     assert (found.radius - 1.0) / 1e-3 == pytest.approx(rate, rel=0.05)
 
 
+def test_eigenvalue_has_the_damping_of_an_impedance_without_stiffness(plain):
+    def find(fraction, damping):
+        damped = add_impedance(compensate(plain, fraction), KNEE, VALUES, Impedance(stiffness=0.0, damping=damping))
+        return find_worst_gravity(damped, KNEE, VALUES, [{}]).radius
+
+    left = 4.0 * 9.81 * 0.2 * (1.0 - 1.2)
+    rate = (-5.5 + np.sqrt(5.5**2 - 4.0 * 0.3 * left)) / 0.6
+    assert (find(1.2, 5.0) - 1.0) / 1e-3 == pytest.approx(rate, rel=0.05)
+    assert find(0.8, 200.0) > 1.0  # more than the force loop renders
+
+
 def test_a_link_that_weighs_less_than_is_compensated_is_found(plain):
     lighter = [{}, {"m": 3.5}, {"m": 4.5}]
     whole = compensate(plain, 1.0)
