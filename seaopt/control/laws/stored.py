@@ -176,6 +176,8 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
     made["blocks"] = blocks
     check_agrees(content, made, FILE, remedy=TUNE_AGAIN, rtol=AGREES)
     law = table.law.build(ts)
+    if outer is not None and not outer.position:  # a file from before it was stored
+        raise _contradict("blocks.impedance.position", "is missing: the output that the outer loop reads")
     if (link is None) != (spec.link_feedforward is None):
         raise _contradict("blocks.link_feedforward", "is not that of spec.link_feedforward")
     reads = _check_measured(table, law)

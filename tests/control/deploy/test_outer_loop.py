@@ -84,6 +84,9 @@ def test_it_is_stored_and_read_again(controller):
     assert content["blocks"]["impedance"]["direction"] == -1.0
     read = Controller.from_dict(content, so.plants.high_impedance(), THOR)
     assert read.outer == controller.outer
-    content["blocks"]["impedance"]["stiffness"] = -1.0
+    position = content["blocks"]["impedance"].pop("position")
+    with pytest.raises(so.SeaoptError, match=r"impedance\.position is missing.*tune again"):
+        Controller.from_dict(content, so.plants.high_impedance(), THOR)
+    content["blocks"]["impedance"] |= {"position": position, "stiffness": -1.0}
     with pytest.raises(so.SeaoptError, match=r"impedance.*stiffness"):
         Controller.from_dict(content, so.plants.high_impedance(), THOR)
