@@ -32,14 +32,25 @@ def test_a_plant_that_was_not_tuned_for_is_named_and_helps_when_it_is(stand, tho
     assert so.certify(both, plants, thor, simulations=False).met
 
 
+def test_to_tune_for_a_plant_is_advised_only_where_that_is_possible(stand, thor):
+    controller = so.tune(stand, thor, SPEC)
+    assert not controller.robust_to
+    row = Requirement(name="max_sensitivity", limit=1.7, value=1.9, met=False, plant="stand")
+    other = so.plants.moving_output()
+    assert "robust_to" in advise(row, controller, models={"stand": other})
+    assert "robust_to" not in advise(row, controller, models={"stand": stand})  # the design plant by its name
+    by_hand = so.assess(controller.law, stand, thor, SPEC)
+    assert "robust_to" not in advise(row, by_hand, models={"stand": other})  # which nothing tunes
+
+
 def test_only_a_limit_that_binds_is_eased(stand, thor):
     controller = so.tune(stand, thor, SPEC)
     assert not any(name.startswith("max_noise_gain") for name in controller.active_constraints)
     error = Requirement(name="steady_error", limit=0.03, value=0.04, met=False, plant="stand")
-    text = advise(error, controller)
+    text = advise(error, controller, models={})
     assert "lower bandwidth_hz" in text and "noise" not in text
     bound = replace(controller, active_constraints=("max_noise_gain", "max_complementary (stand)", "max_noise_gain"))
-    assert advise(error, bound).endswith("or raise max_noise_gain and max_complementary")
+    assert advise(error, bound, models={}).endswith("or raise max_noise_gain and max_complementary")
     assert advise_easing(("min_sensitivity_bandwidth_hz", "shoulder_hz")) == "lower min_sensitivity_bandwidth_hz"
 
 

@@ -27,6 +27,7 @@ from seaopt.reporting.sections.kinds.verification import describe_steps
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.certificate import NO_MODEL
 from seaopt.robustness.certificate.requirement import DESIGN_PLANT, Failure, Requirement, group_failures
+from seaopt.robustness.uncertainty.draws import Plants
 from seaopt.units import unit_after
 
 FROM_DRAWS = ("monte_carlo_failures", "worst_case", "max_failure_probability")
@@ -78,8 +79,9 @@ def judge(certificate: Certificate, commands: Commands) -> Verdict:
         return Verdict(met=True, text=text)
     broken = [row for row in certificate.requirements if not row.met]
     failures = group_failures(broken)
-    reasons = [explain_failure(failure, certificate.controller) for failure in failures]
-    remedies = [advise(failure.worst, certificate.controller) for failure in failures]
+    controller, models = certificate.controller, certificate.models
+    reasons = [explain_failure(failure, controller, models=models) for failure in failures]
+    remedies = [advise(failure.worst, controller, models=models) for failure in failures]
     if certificate.constrained is not None:
         remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]
     first = next((text for text in remedies if text), "")
@@ -108,12 +110,15 @@ def _advise_ranges(certificate: Certificate) -> tuple[str, ...]:
     return ()
 
 
-def advise(row: Requirement, *controllers: Controller) -> str:
+def advise(row: Requirement, *controllers: Controller, models: Plants) -> str:
     """Return what to change where a requirement is not met: by the limits that bind in the laws it is of."""
     limit, remedy = BY_REQUIREMENT.get(row.name), REMEDIES.get(row.name, "")
     if limit is not None:
         plants = {DESIGN_PLANT, *(name for law in controllers for name in law.robust_to)}
-        if limit.scope == "every plant" and row.plant not in plants and all(law.met for law in controllers):
+        designs = [law.design[0] for law in controllers if law.design is not None]
+        plants |= {name for name, model in models.items() if any(model is design for design in designs)}
+        tuned = all(law.met and law.structure != "custom" for law in controllers)
+        if limit.scope == "every plant" and row.plant not in plants and tuned:
             return f'add "{row.plant}" to robust_to in [controller]'
         unmet = [text for law in controllers if not law.met for text in law.blocked_by]
         remedy = f"the tuning says why: {unmet[0]}" if unmet else limit.remedy
@@ -122,12 +127,12 @@ def advise(row: Requirement, *controllers: Controller) -> str:
     return f"{remedy}, or {easing}" if easing else remedy
 
 
-def explain_failure(failure: Failure, *controllers: Controller) -> Reason:
+def explain_failure(failure: Failure, *controllers: Controller, models: Plants) -> Reason:
     """Return what a certificate fails on, by its worst case; `controllers`: the laws it is of."""
     row = failure.worst
     if failure.unstable:
         what = f"unstable on {', '.join(failure.subjects)}"
-        return Reason(what=what, where=f"{advise(row, *controllers)}{failure.consequence}")
+        return Reason(what=what, where=f"{advise(row, *controllers, models=models)}{failure.consequence}")
     value, limit = format_number(row.value, 4), format_number(row.limit, 4)
     return Reason(what=f"{row.name} {value}, limit {row.sense} {limit}", where=row.where, count=failure.count)
 

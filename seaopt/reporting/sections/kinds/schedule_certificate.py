@@ -24,9 +24,10 @@ def judge(certificate: ScheduleCertificate, commands: Commands) -> Verdict:
         still = f"{certificate.schedule.over} standing still"
         return Verdict(met=True, text=f"Certificate: passed with {still}, {drawn}{swept}")
     broken = [row for row in certificate.requirements if not row.met]
-    reasons = tuple(explain_failure(failure, *certificate.schedule.controllers) for failure in group_failures(broken))
+    laws, models = certificate.schedule.controllers, certificate.places[0].models
+    reasons = tuple(explain_failure(failure, *laws, models=models) for failure in group_failures(broken))
     command = f"type {commands.certify}" if commands.certify else "tune again"
-    remedies = (row.remedy or advise(row, *certificate.schedule.controllers) for row in broken)
+    remedies = (row.remedy or advise(row, *laws, models=models) for row in broken)
     change = next((text for text in remedies if text), "raise reserve, or add points")
     return Verdict(
         met=False,
