@@ -47,6 +47,44 @@ def test_a_reading_counts_once_where_a_cubic_takes_it(files):
     np.testing.assert_allclose(cubic[read], FAST[read] ** 3 - FAST[read], atol=1e-12)
 
 
+def test_beside_a_hole_readings_are_no_further_off_than_at_an_end():
+    """Of a cubic's nodes none lies across: 5 Hz in 50 Hz, half a sample off, without 0.2 s; and one lost sample."""
+    at, time = np.arange(300) / 100, 0.005 + np.arange(150) / 50
+    whole = Readings()(at, time, np.sin(10 * np.pi * time))
+    usual = np.nanmax(np.abs(whole - np.sin(10 * np.pi * at)))
+    assert usual == pytest.approx(0.0053, abs=1e-4)
+    for start in np.arange(0.9, 1.1, 0.01):
+        for stop in (start + 0.02, start + 0.2):
+            kept = (time < start) | (time > stop)
+            found = Readings()(at, time[kept], np.sin(10 * np.pi * time[kept]))
+            assert np.nanmax(np.abs(found - np.sin(10 * np.pi * at))) < 1.15 * usual
+            assert np.count_nonzero(np.isfinite(whole)) - np.count_nonzero(np.isfinite(found)) <= np.sum(~kept) + 2
+            assert not np.any(np.isfinite(found[(at > time[kept & (time < start)][-1]) & (at < stop)]))
+            read = (at < start - 0.08) | (at > stop + 0.08)
+            np.testing.assert_array_equal(found[read], whole[read])
+
+
+@pytest.mark.parametrize("rate_hz", [130.0, 500.0])
+def test_readings_of_a_faster_clock_are_refused_rather_than_left_out(tmp_path, rate_hz):
+    """Also where the log stands still in between; of one as fast and uneven none is."""
+    at, time = np.arange(300) / 100, np.arange(0.0, 3.0, 1.0 / rate_hz)
+    for instants in (at, np.delete(at, slice(100, 200))):
+        with pytest.raises(LogError, match=rf"Readings: .*{rate_hz / 100:g} times.*log's clock.*Linear"):
+            Readings()(instants, time, np.sin(time))
+    with pytest.raises(LogError, match="times"):
+        Readings()(at, np.delete(time, slice(20, time.size // 2)), np.ones(time.size - time.size // 2 + 20))
+    drive = [*(f"{t},0" for t in at), *[","] * (time.size - at.size)]
+    rows = [f"{columns},{t},{t**2}" for columns, t in zip(drive, time, strict=True)]
+    (tmp_path / "fast.csv").write_text("\n".join(["t [s],I [A],t2 [s],F [N]", *rows]))
+    cell = Column(column="F [N]", time="t2 [s]", align=Readings())
+    with pytest.raises(LogError, match=r'clock "t2 \[s\]".* F: Readings: '):
+        read_table(tmp_path / "fast.csv", time="t [s]", channels={"I": "I [A]", "F": cell})
+    uneven = np.sort(np.random.default_rng(1).uniform(0.0, 3.0, 300))
+    assert np.count_nonzero(np.isfinite(Readings()(at, uneven, uneven))) > 150
+    for count in range(1, 300):
+        Readings()(at, np.arange(count) / 125, np.ones(count))
+
+
 def test_hold_never_looks_ahead(files):
     table = read_table(files, time="t [s]", channels=channels(align=Hold()))
     for t, value in zip(FAST, table.signals["F"].values, strict=True):

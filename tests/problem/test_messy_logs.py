@@ -142,6 +142,19 @@ def test_two_clocks_of_a_matlab_file_are_brought_together(tmp_path, held):
     assert np.count_nonzero(np.isfinite(experiment.log["tau_s"])) == pytest.approx(slow.size, abs=2)
 
 
+def test_a_sensor_of_a_faster_clock_loses_no_readings_without_a_word(tmp_path, held):
+    """Of a cell that began late the samples are fewer, and yet twice as fast: lines go through all."""
+    t, of = held
+    fast = np.arange(4.0, 5.9, 0.5 / RATE)
+    content = {"t_cell": fast, "cell_torque": np.interp(fast, t, of["tau_s"]), "t_drive": t, "iq": of["I"]}
+    write_v5(tmp_path / "two.mat", content)
+    proposal = propose([tmp_path / "two.mat"], {}, tmp_path)
+    assert roles_of(proposal) == {"time": "log.t_drive", "input": "log.iq", "tau_s": "log.cell_torque"}
+    assert "linear = {}" in proposal.text and "readings" not in proposal.text
+    (experiment,) = read_back(tmp_path, proposal)
+    assert np.all(np.isfinite(experiment.log["tau_s"]))
+
+
 def test_a_torque_that_is_a_constant_times_the_current_is_no_sensor(tmp_path, held):
     """A drive reports 0.1095 times its current, to four digits; the transducer's name says less."""
     t, of = held

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from seaopt.errors import LogError
+from seaopt.logs.quality.clock import measure_steps
 from seaopt.records import record
 
 TICK = 1e-9  # seconds within which two instants are one: an offset that is taken off leaves rounding behind
+MOST_PACE = 1.25  # readings for an instant: of a faster clock `Readings` would leave out too many
 
 
 @record
@@ -123,6 +125,7 @@ class Nearest:
 class Readings:
     """Each sample once, at the instant nearest to it, to which the cubic through four samples takes it; elsewhere there
     is none: outputs of a slower or a shifted clock, of which lines between samples would make more than was measured.
+    Nothing is taken across a hole of the channel. A clock of more than 1.25 times the log's rate is refused (LogError).
 
     Examples
     --------
@@ -143,21 +146,26 @@ class Readings:
         """Return the values at the instants `at`, NaN where the rule has none."""
         out, read = np.full(at.size, np.nan), np.isfinite(values)
         time, values = time[read], values[read]
-        points = min(4, time.size)
-        if at.size < 2 or not points:
+        if at.size < 2 or not time.size:
             return out
-        after = np.clip(np.searchsorted(at, time), 1, at.size - 1)
-        row = np.where(time - at[after - 1] < at[after] - time, after - 1, after)
-        near = np.abs(at[row] - time) <= 0.5 * float(np.median(np.diff(at))) + TICK
-        row = np.unique(row[near & (at[row] >= time[0] - TICK) & (at[row] <= time[-1] + TICK)])
-        first = np.clip(np.searchsorted(time, at[row]) - points // 2, 0, time.size - points)
-        nodes = first[:, None] + np.arange(points)
-        away = at[row, None] - time[nodes]
-        out[row] = 0.0
-        for i in range(points):
-            beside = np.arange(points) != i
-            weights = away[:, beside] / (time[nodes[:, [i]]] - time[nodes[:, beside]])
-            out[row] += np.prod(weights, axis=1) * values[nodes[:, i]]
+        pace = measure_pace(at, time)
+        if pace > MOST_PACE:
+            raise LogError(
+                f"Readings: time has about {pace:.2g} times as many samples as the log's clock has instants, and those "
+                "in excess would be left out; make it the log's clock, or align by Linear()"
+            )
+        row, near = _find_nearest(at, time)
+        row = np.unique(row[near])
+        first, last = _split_at_holes(time)
+        part = np.searchsorted(time[first], at[row] + TICK) - 1
+        inside = (part >= 0) & (at[row] <= time[last[part]] + TICK)
+        row, first, last = row[inside], first[part[inside]], last[part[inside]]
+        size = np.minimum(last - first + 1, 4)
+        for points in range(1, 5):  # a short part between holes has less than four
+            few = size == points
+            start = np.searchsorted(time, at[row[few]]) - points // 2
+            nodes = np.clip(start, first[few], last[few] - points + 1)[:, None] + np.arange(points)
+            out[row[few]] = _interpolate(at[row[few]], time[nodes], values[nodes])
         return out
 
 
@@ -176,6 +184,42 @@ def check_increasing(time: Float[np.ndarray, " m"], clock: str) -> None:
         row = int(np.flatnonzero(step <= 0)[0]) + 1
         how = "repeats" if step[row - 1] == 0 else "runs backwards"
         raise LogError(f"{clock} {how} at sample {row + 1} (t = {time[row]:g} s); sort or remove such rows")
+
+
+def measure_pace(at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> float:
+    """Return how many samples a clock has for an instant of another, where both run; rather too few than too many."""
+    first, last = _split_at_holes(time)
+    inside = np.searchsorted(at, time[last] + TICK) - np.searchsorted(at, time[first] - TICK)
+    _, near = _find_nearest(at, time)
+    return float((np.count_nonzero(near) - first.size) / (np.sum(inside) + first.size))
+
+
+def _split_at_holes(time: Float[np.ndarray, " m"]) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Return the first and the last sample of each part of a clock between its holes."""
+    step = np.diff(time)
+    holes = np.flatnonzero(step > measure_steps(step)[1]) if step.size else np.empty(0, np.int64)
+    return np.append(0, holes + 1), np.append(holes, time.size - 1)
+
+
+def _find_nearest(
+    at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]
+) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """Return the instant nearest to each sample, and whether it is within half a step."""
+    after = np.clip(np.searchsorted(at, time), 1, at.size - 1)
+    row = np.where(time - at[after - 1] < at[after] - time, after - 1, after)
+    return row, np.abs(at[row] - time) <= 0.5 * float(np.median(np.diff(at))) + TICK
+
+
+def _interpolate(
+    at: Float[np.ndarray, " n"], time: Float[np.ndarray, "n p"], values: Float[np.ndarray, "n p"]
+) -> Float[np.ndarray, " n"]:
+    """Return the polynomial through the points of each instant."""
+    out = np.zeros(at.size)
+    for i in range(time.shape[1]):
+        beside = np.arange(time.shape[1]) != i
+        weights = (at[:, None] - time[:, beside]) / (time[:, [i]] - time[:, beside])
+        out += np.prod(weights, axis=1) * values[:, i]
+    return out
 
 
 def _neighbours(

@@ -261,7 +261,10 @@ def _read_channels(
         for name, channel in group.items():
             if channel.rule is None:
                 raise LogError(f"{where}: has other instants than the log's clock; {HOW_TO_ALIGN}", keys=ALIGNED)
-            arrays[name] = channel.rule(clock, time, columns[channel.file_column.field.name])
+            try:
+                arrays[name] = channel.rule(clock, time, columns[channel.file_column.field.name])
+            except LogError as error:
+                raise LogError(f"{where}: {name}: {error}", keys=ALIGNED[1:]) from error
             outside = int(np.sum(~((clock >= time[0]) & (clock <= time[-1]))))
             note = f'{name}: brought from clock "{other.name}" by {channel.rule}'
             if outside:

@@ -195,7 +195,8 @@ def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, intervie
     if scale < 0.0:
         interview.assume(f"sign:{column.name}")
         guesses.append("guessed: sign reversed, as it falls when the effort rises")
-    rule = "readings" if role != log.roles.input else "linear" if column.header.measured else "hold"
+    smooth = column.fast if role != log.roles.input else column.header.measured
+    rule = "linear" if smooth else "readings" if role != log.roles.input else "hold"
     keys = _spell_clock(column, log, rule) if column.clock else {}
     return f"{name} = {_spell_column(column.name, unit, scale, keys)}", "; ".join([*notes, *filter(None, guesses)])
 

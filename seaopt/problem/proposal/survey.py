@@ -15,6 +15,7 @@ from seaopt.errors import LogError, suggestion
 from seaopt.formatting import join_words
 from seaopt.logs import contents
 from seaopt.logs.formats import Field, open_source
+from seaopt.logs.log.alignment import MOST_PACE, measure_pace
 from seaopt.logs.log.resampling import fill_holes
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.logs.quality.findings import MOST_BRIDGED
@@ -41,6 +42,7 @@ class SurveyedColumn:
     # interpolated to that
     clock: str = ""
     readings: Float[np.ndarray, " m"] | None = None  # before they were interpolated, if they were
+    fast: bool = False  # whether its own times are too many for the log's to have each reading once
     hole: int = 0  # the largest number of rows that were empty in turn, and interpolated
 
     @property
@@ -256,7 +258,7 @@ def _move_to_clock(
     if not groups:
         return {}, None
     time, moved = raw[clock.name] * factor(_read_unit(clock.name, headers, raw), "s"), dict[str, SurveyedColumn]()
-    low, high = float(np.nanmin(time)), float(np.nanmax(time))
+    low, high, instants = float(np.nanmin(time)), float(np.nanmax(time)), np.unique(time[np.isfinite(time)])
     for other, names in groups.items():
         own = raw[other] * factor(_read_unit(other, headers, raw), "s")
         there = np.isfinite(own)
@@ -267,7 +269,10 @@ def _move_to_clock(
             if name != other:
                 good = there & np.isfinite(raw[name])
                 values = np.interp(time, own[good], raw[name][good], np.nan, np.nan) if np.any(good) else raw[name]
-                moved[name] = SurveyedColumn(header=headers[name], values=values, clock=other, readings=raw[name][good])
+                moved[name] = SurveyedColumn(
+                    header=headers[name], values=values, clock=other, readings=raw[name][good],
+                    fast=bool(np.any(good)) and measure_pace(instants, own[good]) > MOST_PACE,
+                )  # fmt: skip
     return moved, (low, high) if low < high else None
 
 
