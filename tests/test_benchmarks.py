@@ -45,6 +45,19 @@ def test_least_times_of_turns_that_alternate(monkeypatch):
     assert calls == ["ours", "theirs"] * 4
 
 
+def test_of_laws_that_were_not_played_none_is_counted_as_right(monkeypatch):
+    """With --exact only refused laws are played."""
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    judge = load_script("judge/run", monkeypatch)
+    row = {"fit_met": True, "certified": True, "refused": []}
+    played = row | {"ms": 1.4, "refused": ["log_sensitivity"]}
+    rows = [row, row, played | {"bad": False}, played | {"bad": True}, {"status": "none"}]
+    assert list(judge.summarise(rows)) == [
+        "5 cases, 4 tuned; 4 on fits that are met",
+        "refused by a log alone     2, of which fine 1",
+    ]
+
+
 EMPS = {"M": 95.1, "F_v": 203.5, "F_c": 20.39, "O": -3.165}
 BELT = {"K": 36.0, "b": 20.0, "k_m": 367.0, "k_p": 142.0, "c": 0.003}
 SILVERBOX = {"w": 428.0, "zeta": 0.0228, "g": 0.5, "a_2": 0.1, "a_3": 2.0, "o": 1e-3}
