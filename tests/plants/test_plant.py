@@ -26,6 +26,14 @@ def build(**changes):
     return so.Plant(**{**GOOD, **changes})
 
 
+@pytest.mark.parametrize("rotary_first", [False, True])
+def test_defaults_of_built_in_plants_are_plausible(rotary_first):
+    """A fit does not question a fixed value that is its default."""
+    declared = so.plants.known_parameters(rotary_first=rotary_first).values()
+    ranges = {each.name: (each.value, *each.plausible) for each in declared if each.plausible is not None}
+    assert len(ranges) > 40 and not {name for name, (value, low, high) in ranges.items() if not low <= value <= high}
+
+
 def test_a_plant_in_a_few_lines():
     model = build().linearize(so.ParameterSet.of(m=(2.0, "kg"), c=(4.0, "N s/m")))
     np.testing.assert_allclose(np.sort(model.poles().real), [-2.0, 0.0])
