@@ -153,6 +153,7 @@ def accept(
     A log that has every n-th tick is compared line by line, which takes a periodic reference whose lines lie below half
     of the log's rate, and whose period is a whole number of rows. It is of this law where it excludes those with a gain
     of half its size, with a reference, reading or command that is halved, or with a tick more delay; else undecided.
+    Laws with another part that it does not exclude are its replay's `possible`.
 
     A law with an outer loop is replayed with it where the reference is the link's place, in m or rad, and the link's
     position is in the log; no response follows. A reference in N or N m is the one that the force law was given.

@@ -16,7 +16,8 @@ of a command that is as good as the same, :math:`a = \Phi^T d/\Phi^T\Phi` is the
 
 - The law is *refuted* where :math:`|d|^2` is more than noise leaves, or a share is not zero.
 - It is *confirmed* where in each case another share than one is sure: of a gain of half its size, of a reference,
-  reading or command that is halved, of a tick's delay.
+  reading or command that is halved, of a tick's delay. Of laws with a part left out, or made for another rate, it says
+  which are not excluded: few references tell all of them.
 - Else the log cannot tell. The std falls with the root of the periods, which says how many would do.
 """
 
@@ -64,6 +65,7 @@ class LineMatch:
     off: Float[np.ndarray, " m"] | None = None  # of the command at each line, in its unit
     allowed: float | None = None  # rms, in the command's unit
     late: int = 0  # ticks
+    possible: tuple[Cause, ...] = ()  # laws with other parts, which are not excluded beside it
 
     @property
     def tells(self) -> bool:
@@ -83,6 +85,7 @@ class Shift:
     value: float | None = None
     base: float | None = None  # of what is scaled: its size, of which the shift is a half
     asked: bool = False  # it has to be excluded
+    part: bool = False  # or else is named beside the law: few references tell it
 
     def name(self, share: float, signals: Sequence[str]) -> tuple[str, float | None]:
         """Return its kind and value where a share of it is there."""
@@ -131,6 +134,11 @@ class Off:
         vector = self.scale(mean)
         size = float(vector @ vector)
         return (float(vector @ self.scale(self.mean)) / size, size**-0.5) if size else (0.0, math.inf)
+
+    def excludes(self, mean: Lines) -> bool:
+        """Tell whether another share than one is sure."""
+        share, std = self.fit(mean)
+        return abs(share) + self.sigmas * std < 1.0
 
 
 @record(eq=False)
@@ -198,11 +206,14 @@ class Table:
 
     def list_late(self, taken: int) -> Iterator[Shift]:
         """Yield commands that are logged otherwise late than is taken."""
-        ones = replace(self.blocks, effort=np.ones_like(self.made))
         for late in LATE:
             if late != taken:
-                commands = self.made * (shift_command(self.controller, ones, taken - late).effort - 1.0)
+                commands = self.made * (self.turn(taken - late) - 1.0)
                 yield Shift(kind="late", what="command", commands=commands, value=late, unit="ticks", asked=True)
+
+    def turn(self, ticks: int) -> Parts:
+        """Return what commands so many ticks earlier are multiplied by."""
+        return shift_command(self.controller, replace(self.blocks, effort=np.ones_like(self.made)), ticks).effort
 
     def list_shifts(self, others: Mapping[str, Controller]) -> Iterator[Shift]:
         """Yield what may run in place of the law, or stand in its log."""
@@ -232,11 +243,12 @@ class Table:
             changed = half.law(structure, period).balanced()
             asked = _matters(law, changed)
             yield Shift(kind="gain", what=name, commands=self.differ(changed), base=sizes[name], asked=asked)
-        for kind, what, value, part in list_parts(gains):
-            yield Shift(kind=kind, what=what, commands=self.differ(part.law(structure, period)), value=value)
-        for factor in (0.5, 2.0):
-            commands, rate = self.differ(gains.law(structure, factor * period)), 1.0 / (factor * period)
-            yield Shift(kind="rate", what="gains", commands=commands, value=rate, unit="Hz")
+        rates = [factor * period for factor in (0.5, 2.0)]
+        parts = [(kind, what, value, "", part.law(structure, period)) for kind, what, value, part in list_parts(gains)]
+        parts += [("rate", "gains", 1.0 / each, "Hz", gains.law(structure, each)) for each in rates]
+        for kind, what, value, unit, changed in parts:
+            commands, asked = self.differ(changed), _matters(law, changed)
+            yield Shift(kind=kind, what=what, commands=commands, value=value, unit=unit, asked=asked, part=True)
 
     def differ(self, law: Law) -> Parts:
         """Return what another law makes more than this one."""
@@ -285,7 +297,7 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Mapping[str, Contr
     table = Table.make(controller, ticks, blocks, ticks_per_row)
     tried = [table.try_late(late) for late in LATE]
     found, shifts = min(tried, key=lambda each: each.misfit), [*table.list_shifts(others)]
-    asked = [*shifts, *table.list_late(found.late)]
+    asked, possible = [*shifts, *table.list_late(found.late)], ()
     vectors = [table.average(shift.commands) for shift in asked]
     if is_off(found, asked, vectors):
         named = [name_causes(each, shifts, vectors, controller.signals) for each in tried]
@@ -298,9 +310,10 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Mapping[str, Contr
                 causes = (leave_open("aliases", "reference"),)
     else:
         causes = list_untold(found, asked, vectors, blocks.period_s * len(blocks.reference))
+        possible = list_possible(found, shifts, table)
     size = np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0)) * abs(controller.command.per_effort)
     allowed = float(np.sqrt(np.sum((found.std * size) ** 2)))
-    return LineMatch(causes=causes, off=np.abs(found.mean) * size, allowed=allowed, late=found.late)
+    return LineMatch(causes=causes, off=np.abs(found.mean) * size, allowed=allowed, late=found.late, possible=possible)
 
 
 def evaluate(law: Law, blocks: Blocks, ticks_per_row: int, image: int = 0) -> Complex[np.ndarray, "k m"]:
@@ -348,10 +361,9 @@ def list_untold(found: Off, shifts: Sequence[Shift], means: Sequence[Lines], sec
     """
     untold: list[Cause] = []
     for shift, mean in zip(shifts, means, strict=True):
-        share, std = found.fit(mean)
-        if not shift.asked or abs(share) + found.sigmas * std < 1.0:
+        if shift.part or not shift.asked or found.excludes(mean):
             continue
-        needed = math.inf
+        needed, (_, std) = math.inf, found.fit(mean)
         if math.isfinite(std):
             vector = found.scale(mean)
             part = float(np.sum((vector * np.tile(found.noise / found.std, 2)) ** 2)) * std**2  # that periods lessen
@@ -360,6 +372,19 @@ def list_untold(found: Off, shifts: Sequence[Shift], means: Sequence[Lines], sec
         value = seconds * needed if math.isfinite(needed) else None
         untold.append(leave_open(SHORT[shift.kind], shift.what, value, "s"))
     return tuple(sorted(untold, key=lambda cause: -(cause.value or math.inf)))
+
+
+def list_possible(found: Off, shifts: Sequence[Shift], table: Table) -> tuple[Cause, ...]:
+    """Return the laws with another part that the log does not exclude beside the law, its command logged late or not:
+    a filter that is slower is much like a command that is logged later.
+    """
+    turns, made = [table.turn(found.late - late) for late in LATE], table.made
+    return tuple(
+        Cause(kind=shift.kind, what=shift.what, value=shift.value, unit=shift.unit, removes=0.0, explains=False)
+        for shift in shifts
+        if shift.part and shift.asked
+        if not all(found.excludes(table.average((made + shift.commands) * turned - made)) for turned in turns)
+    )
 
 
 Rank = tuple[bool, float]

@@ -293,6 +293,11 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     remarks += tuple(
         f"A log has one row for {each} ticks: it is compared at the lines of the reference." for each in rows_of
     )
+    remarks += tuple(
+        f"{Path(source).name} does not exclude that {', or that '.join(map(say_cause, row.possible))}."
+        for source, row in zip(result.sources, result.replays, strict=True)
+        if row.met and row.possible
+    )
     sections = [
         Section(
             title="Replay",

@@ -38,6 +38,7 @@ class Replay:
     law_rate_hz: float
     ticks_per_row: int = 1  # of a log that has every n-th tick: it was compared line by line
     causes: tuple[Cause, ...] = ()
+    possible: tuple[Cause, ...] = ()  # of a log with every n-th tick: laws with other parts that it does not exclude
 
     @property
     def undecided(self) -> bool:
@@ -105,4 +106,5 @@ def _describe_lines(setting: Setting, match: LineMatch, ticks_per_row: int) -> R
         law_rate_hz=1.0 / setting.controller.sample_time_s,
         ticks_per_row=ticks_per_row,
         causes=match.causes,
+        possible=match.possible,
     )

@@ -220,6 +220,23 @@ def test_few_rows_of_a_right_law_are_never_another_and_a_halved_gain_is_never_th
             assert row.undecided or np.isclose(cause.value, 0.5 * controller.gains[name], rtol=0.2)
 
 
+@pytest.mark.parametrize("every", [2, 10])
+def test_a_law_with_another_part_is_refuted_or_named_beside_this_law(controller, compiler, tmp_path, bench, every):
+    from seaopt.control import Gains
+
+    law = replace(Gains.from_names(controller.gains), T_f=0.5 * controller.gains["T_f"]).law("pid", 1e-3).balanced()
+    custom = replace(controller, law=law, structure="custom", gains={}, spec=replace(SPEC, structure="custom"))
+    other, reference = Bench(compiler, tmp_path, custom), multisine(1000, SLOW, 12, 60.0, 1, bias=300.0)
+    result = so.accept(controller, [keep_every(other.log(Machine(), reference), every)])
+    (row,) = result.replays
+    named = [(cause.kind, cause.what, cause.value) for cause in row.possible]
+    assert not row.met or ("gain", "T_f", 0.5 * controller.gains["T_f"]) in named
+    if row.met:
+        assert "does not exclude that the gain T_f is" in str(result).replace("\n", " ")
+        assert result.to_dict()["replay"]["logs"][0]["possible"]
+    assert so.accept(controller, [keep_every(bench.log(Machine(), reference), every)]).replayed
+
+
 def test_the_seconds_that_would_decide_do(controller, bench):
     short = keep_every(bench.log(Machine(), multisine(1000, SLOW, 4, 20.0, 1, bias=300.0)), 10)
     (row,) = so.accept(controller, [short]).replays
