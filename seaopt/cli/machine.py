@@ -50,6 +50,7 @@ log = "{log}"
 time = "time [s]"
 inputs = {{ {inputs} }}
 outputs = {{ {outputs} }}
+feedback = true
 """
 
 

@@ -5,7 +5,8 @@ With the simulated outputs :math:`\hat y` of a model, the outputs' errors :math:
 .. math:: \hat E = \frac{\sum_d \bar U_d E_d}{\sum_d |U_d|^2}, \qquad
           |\hat E - E|^2 \le \frac{\sum_d |E_d - \hat E U_d|^2}{\sum_d |U_d|^2}\,\big(\alpha^{-1/(n-1)} - 1\big)
 
-over windows d, with the probability :math:`1 - \alpha` for whatever input, the noise being as strong throughout (Ljung,
+over windows d, with the probability :math:`1 - \alpha` for whatever input that does not depend on the noise, the noise
+being as strong throughout (Ljung,
 Model validation and model error modeling, 1999). The power of what is left is averaged over neighbouring lines, each of
 which counts as about half a line more, unless it is larger at its own, as of a hum. What the model explains leaves no
 transients in e, so that chirps and short logs can be read; of the linear plant the truth is then
@@ -26,6 +27,11 @@ from seaopt.frequency.measured import UNSEEN
 from seaopt.frequency.response import Lines
 from seaopt.records import record
 
+LAGS = 64  # samples that predict errors and input
+AHEAD, FAR = 16, 256  # samples within which a law answers, and up to which the input is looked at
+BLOCK, MOST_BLOCKS = 2000, 20  # samples that a law's answer is sought in, and how many times
+FALSE_ALARM = 1e-4
+UNFELT = 1e-4  # of the input's std: less of it is not taken for an answer
 LENGTHS = 4  # of windows, each half of the one before
 FEWEST = 8  # windows
 MOST = 1000
@@ -112,3 +118,39 @@ def _average(u: Any, model: Any, error: Any, period: float, starts: Any, length:
         rough=(np.sum(welch.square(left[:y]), axis=1) / power / rest)[:, inner],
         freedom=rest * NEAR / ALIKE,
     )
+
+
+def find_feedback(
+    u: Float[np.ndarray, " n"], error: Float[np.ndarray, "y n"], runs: Sequence[slice], alpha: float = FALSE_ALARM
+) -> bool:
+    """Tell whether the input answers the noise: whether what past input and errors do not predict of an error is
+    correlated with what the past of input soon after does not predict of it.
+
+    In an open loop the first is noise, and independent of later input, whatever that is. What a nonlinear plant leaves
+    in it is as much correlated with input long after, which the soon correlations are compared with.
+    """
+    from scipy.special import chdtri  # deferred: 0.1 s
+
+    stretches = [(a, min(a + BLOCK, run.stop)) for run in runs for a in range(run.start, run.stop, BLOCK)]
+    stretches = [(a, b) for a, b in stretches if b - a >= BLOCK // 2][:MOST_BLOCKS]
+    if not stretches:
+        return False
+    floor, outputs = UNFELT * float(np.nanstd(u)), len(error)
+    sums, powers = np.zeros((outputs, FAR)), np.zeros((outputs, FAR))
+    for a, b in stretches:  # a prediction of each follows a chirp
+        view = np.lib.stride_tricks.sliding_window_view(np.vstack([u[a:b], error[:, a:b]]), LAGS + 1, axis=1)
+        later = _leave(view[0, :, :-1], view[0, :, -1])
+        noises = _leave(np.hstack([view[0], *view[1:, :, :-1]]), view[1:, :, -1].T).T
+        for lag in range(1, FAR + 1):
+            product = noises[:, :-lag] * later[lag:]
+            sums[:, lag - 1] += np.sum(product, axis=1)
+            powers[:, lag - 1] += np.sum(np.maximum(product**2, (noises[:, :-lag] * floor) ** 2), axis=1)
+    each = sums**2 / np.maximum(powers, 1e-300)
+    beside = np.maximum(np.mean(each[:, LAGS:], axis=1), 1.0)
+    return bool(np.any(np.max(each[:, :AHEAD], axis=1) > beside * chdtri(1, alpha / (AHEAD * outputs))))
+
+
+def _leave(regressors: Any, target: Any) -> Any:
+    """Return what a linear prediction with a mean leaves of a target."""
+    a = np.column_stack([regressors, np.ones(len(regressors))])
+    return target - a @ np.linalg.lstsq(a, target, rcond=1e-10)[0]

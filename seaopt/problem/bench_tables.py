@@ -293,6 +293,7 @@ class ExperimentTable(StrictTable):
     )
     mask: Literal["auto", "declared", "none"] = key("Whether flat tops lose their weight.", default="auto")
     gaps: Literal["split", "error"] = key('Cut the log at gaps, or refuse it ("error").', default="split")
+    feedback: Flag = key("Taken under a law: its input carries noise, and it judges no certificate.", default=False)
 
 
 class AcceptanceTable(StrictTable):

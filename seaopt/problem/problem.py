@@ -331,6 +331,7 @@ class Problem:
             delay_s=_make_unknown("delay_s", "s", table.delay_s),
             hold=table.hold,
             gaps=table.gaps,
+            feedback=table.feedback,
             drift=table.drift,
             shots=table.shots,
             saturation=table.saturation,

@@ -80,7 +80,7 @@ def test_an_accepted_log_is_an_experiment_of_a_fit(folder, accept):
     problem = so.read_problem(folder / "again.toml")
     (experiment,) = problem.experiments()
     log, raw = experiment.log, so.read_log(folder / "good.csv")
-    assert experiment.delay_s == 0.0  # the program's sample of delay is in the rows
+    assert experiment.feedback and experiment.delay_s == 0.0  # the program's sample of delay is in the rows
     assert np.array_equal(log["I"], raw["I"][:-1]) and np.array_equal(log["F1"], raw["F1"][1:])
 
 

@@ -86,6 +86,9 @@ class Experiment:
     differences : mapping of output to Difference
         Measured speeds that are differences of a position over samples of this log: outputs that the plant then has
         besides its own. What the device held before a segment's first sample is part of the initial state.
+    feedback : bool
+        The log was taken under a law that reads the outputs, so that its input carries their noise. It is fitted as
+        any other, best by errors of prediction; as a judge of a certificate's law it would be wrong, and is none.
 
     Attributes
     ----------
@@ -117,6 +120,7 @@ class Experiment:
     shots: int = 1
     parameters: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
     differences: Mapping[str, Difference] = field(default_factory=dict[str, Difference])
+    feedback: bool = False
     log_segments: tuple[slice, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -125,6 +129,7 @@ class Experiment:
             (self.log, Log, "log", "give a Log"),
             (self.name, str, "name", "give a text"),
             (self.outputs, (tuple, list), "outputs", "give names in a tuple"),
+            (self.feedback, bool, "feedback", "give True or False"),
         ):
             require_type(value, kind, what, remedy, EstimationError)
         if not EXPERIMENT_NAME.fullmatch(self.name):
@@ -347,7 +352,7 @@ class Experiment:
         u = input_samples(self.plant, self.log)
         y = tuple(self.log[name] for name in self.outputs)
         time, first, duration = self.log.time, float(self.log.time[0]), self.log.duration_s
-        used = (time <= first + (1.0 - holdout) * duration).astype(np.uint8) if holdout else None
+        used = (np.arange(len(self.log)) < self.count_fitted(holdout)).astype(np.uint8) if holdout else None
         step = 2.0 * self.log.period / duration
         wholes = [whole for whole in self.log_segments for _ in self._cuts(whole)[1:]]
         return [
@@ -361,6 +366,11 @@ class Experiment:
             )
             for rows, whole in zip(self.segment_rows, wholes, strict=True)
         ]
+
+    def count_fitted(self, holdout: float) -> int:
+        """Return how many samples come before the last fraction `holdout` of the time."""
+        time = self.log.time
+        return int(np.searchsorted(time, time[0] + (1.0 - holdout) * self.log.duration_s, side="right"))
 
     @property
     def segment_rows(self) -> list[slice]:

@@ -10,6 +10,9 @@ radius R (`seaopt.frequency.residual`). Around the model's own response G the la
   1/M_s`, x being the radial bound of R, and lie about the crossover;
 - *undecided* otherwise. Samples that were fitted are not independent: they can refute, and confirm nothing.
 
+A log whose input carries its noise judges nothing: where it was taken under a law (stated, or found in it), or the fit
+is of prediction errors, as of such logs. Where noise dominates G + E would tend to -1/C, whatever the plant is.
+
 Beyond the lines whose discs are small nothing is said, and the model stands as the other checks judge it. With dry
 friction G is the response of the simulated outputs by the same windows, so that model and log are compared at the log's
 amplitude; a line at which the model itself breaks the limit there is one only where the log is worse than the model.
@@ -32,7 +35,7 @@ from seaopt.errors import SeaoptError
 from seaopt.estimation import Experiment, Fit
 from seaopt.estimation.result.findings import Nuisance
 from seaopt.formatting import format_number, join_words
-from seaopt.frequency.residual import LENGTHS, ResidualResponse, measure_residual
+from seaopt.frequency.residual import LENGTHS, ResidualResponse, find_feedback, measure_residual
 from seaopt.frequency.response import ComplexLines, Lines, find_band
 from seaopt.frequency.sampled import sampled_response
 from seaopt.parameters import ParameterSet
@@ -45,6 +48,7 @@ GRACE = 0.05  # of Ms: an actuator is not its model to the last digit
 LARGEST_DISC = 0.5  # of the distance from zero: where discs are larger, the log says nothing
 SMOOTH = 5  # lines of which the median disc decides whether one tells
 FEWEST_LINES = 8
+SHARED = 0.01  # of the samples: slices of one log have an end in common
 PERIODS = 120.0  # of the bandwidth in the longest window
 HIGHEST = 0.5  # of the Nyquist frequency of log and law: above, folding is no longer small
 ABOUT = 0.5, 1.25  # of the crossover, and of where Ms is predicted too: from where to where lines must confirm
@@ -103,8 +107,13 @@ def judge_log(
     needed = [controller.command.input, *(name for name in controller.signals if name in experiment.plant.outputs)]
     if lacking := [name for name in needed if name not in there]:
         return (), f"log {experiment.name} does not judge the law: it has no {join_words(lacking)}"
+    under_law = f"log {experiment.name} was taken under feedback: its input carries its noise, and it judges no law"
+    if experiment.feedback or experiment.log.law or fit.method == "prediction_error":
+        return (), under_law
     try:
         parts = list(_list_records(fit, experiment, controller))
+        if find_feedback(log_input(controller, parts[0]), parts[0].error, _list_runs(controller, parts[0])):
+            return (), under_law
         found = [_judge(controller, fit.parameters, part, ms * (1.0 + GRACE)) for part in parts]
     except SeaoptError as error:
         return (), f"log {experiment.name} does not judge the law: {error}"
@@ -119,22 +128,34 @@ def _list_records(fit: Fit, experiment: Experiment, controller: Controller) -> I
     gain = np.array([predicted.own.gain[name] for name in names])[:, None]
     model = np.array([predicted.model[name] for name in names]) / gain
     error = np.array([predicted.measured[name] for name in names]) / gain - model
-    fitted = any(experiment is each for each in fit.experiments)
     whole = _Record(
         experiment=experiment,
-        samples="fitted" if fitted else "validate",
+        samples="fitted" if any(_shares(each, experiment, fit.holdout) for each in fit.experiments) else "validate",
         own=predicted.own,
         model=model,
         error=error,
         rows=slice(0, n),
     )
     yield whole
-    if fitted and fit.holdout:
-        yield replace(whole, samples="held out", rows=slice(n - int(fit.holdout * n), n))
+    if fit.holdout and any(experiment is each for each in fit.experiments):
+        yield replace(whole, samples="held out", rows=slice(experiment.count_fitted(fit.holdout), n))
 
 
-def _measure(controller: Controller, part: _Record) -> list[ResidualResponse]:
-    """Return the response of a record, up to where a law's loop can be told from it."""
+def _shares(fitted: Experiment, other: Experiment, holdout: float) -> bool:
+    """Tell whether samples that were fitted are another experiment's, too: of one log, or of a file that is read twice
+    in slices that overlap by more than their ends.
+    """
+    if fitted is other or fitted.log is other.log:
+        return True
+    count = fitted.count_fitted(holdout)
+    _, a, b = np.intersect1d(fitted.log.time[:count], other.log.time, assume_unique=True, return_indices=True)
+    names = fitted.log.signals.keys() & other.log.signals.keys()
+    same = (np.array_equal(fitted.log[name][a], other.log[name][b], equal_nan=True) for name in names)
+    return bool(names) and a.size > SHARED * len(other.log) and all(same)
+
+
+def _list_runs(controller: Controller, part: _Record) -> list[slice]:
+    """Return the rows of a record without a gap, in which nothing is missing."""
     log, command = part.experiment.log, log_input(controller, part)
     good = np.isfinite(command) & np.all(np.isfinite(part.model) & np.isfinite(part.error), axis=0)
     good[: part.rows.start] = False
@@ -143,14 +164,20 @@ def _measure(controller: Controller, part: _Record) -> list[ResidualResponse]:
         joined[rows] = True
         joined[rows.start] = False  # no run goes over a gap
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (good & joined).astype(int), [0]]))).reshape(-1, 2)
-    if not np.any(good) or np.ptp(command[good]) == 0.0:
+    return [slice(a, b) for a, b in edges.tolist()]
+
+
+def _measure(controller: Controller, part: _Record) -> list[ResidualResponse]:
+    """Return the response of a record, up to where a law's loop can be told from it."""
+    log, command, runs = part.experiment.log, log_input(controller, part), _list_runs(controller, part)
+    if not runs or np.ptp(np.concatenate([command[run] for run in runs])) == 0.0:
         return []
     return measure_residual(
         command,
         part.model,
         part.error,
         log.period,
-        [slice(a, b) for a, b in edges.tolist()],
+        runs,
         longest_s=PERIODS / controller.spec.bandwidth_hz,
         highest_hz=HIGHEST * 0.5 / max(log.period, controller.sample_time_s),
     )

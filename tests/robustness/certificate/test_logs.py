@@ -10,14 +10,14 @@ import pytest
 import scipy.signal
 
 import seaopt as so
-from seaopt.control import tune_schedule
+from seaopt.control import runnable, tune_schedule
 from seaopt.errors import LogError
 from seaopt.files import to_json
-from seaopt.frequency.residual import measure_residual
+from seaopt.frequency.residual import find_feedback, measure_residual
 from seaopt.problem.stages import certify_problem
 from seaopt.robustness.certificate.limits import LOG_SENSITIVITY
 from seaopt.robustness.certificate.simulated import STEPS
-from seaopt.robustness.uncertainty.logs import GRACE
+from seaopt.robustness.uncertainty.logs import GRACE, judge_log
 from tests.checks import leave_out
 
 RATE, SECONDS, MODE_HZ, ZETA, NOISE = 1000.0, 20.0, 40.0, 0.02, 2.0
@@ -197,6 +197,71 @@ def test_schedule_is_judged_where_its_variable_stood(stand, thor, fit_to):
     certificate = so.certify(schedule, {"stand": stand}, fit, samples=8, simulations=False)
     assert [bool(place.logs) for place in certificate.places] == [True] + [False] * (len(certificate.places) - 1)
     assert [row.place for row in rows_of(certificate)] == [("m_l", m_l)]
+
+
+def run_under(controller, params, seed, reference, noise=NOISE, dither=0.0):
+    """Return the log of a law on the stand, sample by sample, at a chirp of its reference."""
+    law, (b, a), rng = runnable(controller), sampled_stand(params, 0.0), np.random.default_rng(seed)
+    n, growth = round(10.0 * RATE), np.log(1000.0)
+    r = reference * np.sin(2 * np.pi / growth * np.expm1(growth * np.arange(n) / n))
+    state, waiting, order = law.reset(), [0.0] * int(controller.compute_delay_samples), len(a) - 1
+    u, force, measured = np.zeros(n + order), np.zeros(n + order), np.zeros(n)
+    for k in range(order, n + order):
+        past = slice(k - order, k)
+        force[k] = np.dot(b[:0:-1], u[past]) - np.dot(a[:0:-1], force[past])
+        measured[k - order] = force[k] + rng.normal(scale=noise)
+        command, state = law.step(state, float(r[k - order]), float(measured[k - order]))
+        waiting.append(command + rng.normal(scale=dither))
+        u[k] = waiting.pop(0)
+    return so.Log.from_arrays(time=np.arange(n) / RATE, I=u[order:], F1=measured)
+
+
+UNDER_LAW = ((), "log again was taken under feedback: its input carries its noise, and it judges no law")
+
+
+@pytest.mark.parametrize(("reference", "noise", "dither"), [(200.0, 2.0, 0.0), (200.0, 0.02, 0.0), (50.0, 2.0, 0.5)])
+def test_log_under_the_law_neither_refutes_nor_confirms(stand, thor, controller, right, reference, noise, dither):
+    log = run_under(controller, thor, 3, reference, noise, dither)
+    assert judge_log(controller, right, so.Experiment(plant=stand, log=log, name="again"), 1.6) == UNDER_LAW
+
+
+def test_stated_feedback_and_fits_of_prediction_errors_are_notes(stand, thor, controller, right):
+    again = so.Experiment(plant=stand, log=record(thor, 0.0, 2), name="again")
+    assert judge_log(controller, right, again, 1.6)[0]
+    for stated in (replace(again, feedback=True), replace(again, log=replace(again.log, law="0123456789abcdef"))):
+        assert judge_log(controller, right, stated, 1.6) == UNDER_LAW
+    assert judge_log(controller, replace(right, method="prediction_error"), again, 1.6) == UNDER_LAW
+
+
+@pytest.mark.parametrize("size", [0.0, 0.05, 0.2])
+def test_mode_that_the_model_lacks_is_no_feedback(thor, size):
+    n = round(SECONDS * RATE)
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        phase = rng.uniform(0.0, 6.0, (59, 1))
+        sines = np.sum(np.cos(np.pi * np.outer(np.arange(1, 60), np.arange(n) / RATE) + phase), axis=0)
+        for u in (record(thor, seed=seed)["I"], np.repeat(rng.choice([-1.0, 1.0], n // 50), 50), sines):
+            right, true = (scipy.signal.lfilter(*sampled_stand(thor, each), u) for each in (0.0, size))
+            error = true - right + rng.normal(scale=NOISE, size=n)
+            assert not find_feedback(u, error[None], [slice(0, 9000), slice(9001, n)])
+
+
+def test_samples_are_held_out_by_time(stand, thor, controller):
+    log = record(thor)
+    gap = so.Log.from_arrays(time=log.time + 100.0 * (log.time >= 18.0), I=log["I"], F1=log["F1"])
+    experiment = so.Experiment(plant=stand, log=gap, name="gap")
+    fit = so.fit([experiment], thor.update(J=3e-6).free("J", "b_r"), holdout=0.25, diagnostics=False)
+    used = sum(np.count_nonzero(part.keep[0]) for part in experiment.segments(0.25))
+    assert experiment.count_fitted(0.25) == used == 18000
+    verdicts, _ = judge_log(controller, fit, experiment, 1.9)
+    held_out = [verdict.amplitude for verdict in verdicts if verdict.samples == "held out"]
+    assert held_out in ([], [pytest.approx(np.std(log["I"][18000:]))])
+
+
+def test_fitted_log_that_is_given_again_confirms_nothing(stand, thor, controller, right):
+    for log in (right.experiments[0].log, record(thor, 0.0, 1), record(thor, 0.0, 1).between(1.0, 16.0)):
+        ((verdict,), _) = judge_log(controller, right, so.Experiment(plant=stand, log=log, name="same"), 1.9)
+        assert (verdict.samples, verdict.outcome) == ("fitted", "undecided")
 
 
 def test_discs_of_what_a_model_leaves_hold_the_truth_as_often_as_stated():
