@@ -26,16 +26,20 @@ def broken(name, value, limit, plant, **fields):
     return Requirement(name=name, limit=limit, value=value, met=False, plant=plant, **fields)
 
 
+def explain(failure):
+    return explain_failure(failure, models={})
+
+
 def test_the_same_failure_in_twelve_runs_is_said_once():
     rows = [broken("step_overshoot", 1.4 + 0.01 * k, 1.3, f"plant {k}", scenario="step") for k in range(12)]
-    (reason,) = map(explain_failure, group_failures(rows))
+    (reason,) = map(explain, group_failures(rows))
     assert (reason.count, reason.where) == (12, "plant 11, step")
     assert "1.51" in reason.what and "1.3" in reason.what
 
 
 def test_what_must_be_large_is_worst_where_it_is_least():
     rows = [broken("min_disk_margin", value, 0.7, str(value), sense="≥") for value in (0.6, 0.2, 0.5)]
-    (reason,) = map(explain_failure, group_failures(rows))
+    (reason,) = map(explain, group_failures(rows))
     assert reason.where == "0.2"
 
 
@@ -46,7 +50,7 @@ def test_of_an_unstable_plant_only_that_is_said():
         broken("max_complementary", np.inf, 1.3, "swing"),
         broken("max_noise_gain", 30.0, 25.0, "stand"),
     ]
-    unstable, other = map(explain_failure, group_failures(rows))
+    unstable, other = map(explain, group_failures(rows))
     assert "swing" in unstable.what and "2 more" in unstable.where
     assert other.what.startswith("max_noise_gain 30")
 
@@ -57,7 +61,7 @@ def test_of_an_unstable_plant_only_that_is_said():
      ({"plant": "knee", "state": "stuck", "place": ("phi", 0.4)}, "phi = 0.4, knee stuck")],
 )  # fmt: skip
 def test_what_is_unstable_is_named_whatever_its_name_holds(fields, subject):
-    (reason,) = map(explain_failure, group_failures([broken("spectral_radius", 1.2, 1.0, **fields)]))
+    (reason,) = map(explain, group_failures([broken("spectral_radius", 1.2, 1.0, **fields)]))
     assert reason.what == f"unstable on {subject}"
 
 
