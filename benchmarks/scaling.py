@@ -15,13 +15,13 @@ import resource
 import tempfile
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy
 
 import numpy as np
+from bench_fleet import PROBLEM, Here
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND
@@ -31,30 +31,7 @@ STAND, SWING, THOR = so.plants.high_impedance(), so.plants.moving_output(), so.p
 START = THOR.update(J=2e-6, b_r=3e-4).free("J", "b_r")
 SENSORS = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3)
-FLEET = """
-schema = 1
-parameters = { J = { value = 2e-6, free = true }, b_r = { value = 2e-4, free = true } }
-plant.stand.kind = "high_impedance"
-[[experiment]]
-name = "test"
-plant = "stand"
-log = "0.csv"
-time = "time [s]"
-inputs = { I = "I [A]" }
-outputs = { F1 = "F1 [N]" }
-"""
 Call = Callable[[], Any]
-
-
-class Here(Executor):
-    """Works at once, in this thread."""
-
-    _max_workers = 1
-
-    def submit(self, fn, /, *args, **kwargs):
-        future = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
 
 
 def record(samples: int, seed: int = 1, params: so.ParameterSet = THOR) -> so.Log:
@@ -140,9 +117,9 @@ def certify_draws(count: int) -> Call:
 def fit_many(count: int) -> Call:
     """Return the fits of a fleet in this process."""
     folder = Path(tempfile.mkdtemp(prefix="scaling-"))
-    (folder / "stand.toml").write_text(FLEET)
+    (folder / "stand.toml").write_text(PROBLEM)
     for k in range(count):
-        so.write_log(record(2000, seed=k), folder / f"{k}.csv")
+        so.write_log(record(2000, seed=k), folder / f"{k:07d}.csv")
     return lambda: so.fit_fleet(folder / "stand.toml", sorted(folder.glob("*.csv")), executor=Here())
 
 

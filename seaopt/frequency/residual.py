@@ -75,7 +75,7 @@ def measure_residual(
     highest_hz: float,
 ) -> list[ResidualResponse]:
     """Return the response of a model's errors in runs of rows without a gap, by windows of several lengths, none of
-    them longer than `longest_s`. None where the log is too short.
+    them longer than `longest_s`; none where the log is too short.
     """
     length = min(round(longest_s / period), max((run.stop - run.start for run in runs), default=0) // (FEWEST // 2))
     estimates: list[ResidualResponse] = []

@@ -112,7 +112,7 @@ def judge_log(
         return (), under_law
     try:
         parts = list(_list_records(fit, experiment, controller))
-        if find_feedback(log_input(controller, parts[0]), parts[0].error, _list_runs(controller, parts[0])):
+        if find_feedback(_read_command(controller, parts[0]), parts[0].error, _list_runs(controller, parts[0])):
             return (), under_law
         found = [_judge(controller, fit.parameters, part, ms * (1.0 + GRACE)) for part in parts]
     except SeaoptError as error:
@@ -156,7 +156,7 @@ def _shares(fitted: Experiment, other: Experiment, holdout: float) -> bool:
 
 def _list_runs(controller: Controller, part: _Record) -> list[slice]:
     """Return the rows of a record without a gap, in which nothing is missing."""
-    log, command = part.experiment.log, log_input(controller, part)
+    log, command = part.experiment.log, _read_command(controller, part)
     good = np.isfinite(command) & np.all(np.isfinite(part.model) & np.isfinite(part.error), axis=0)
     good[: part.rows.start] = False
     joined = np.zeros(len(log), dtype=bool)
@@ -169,7 +169,7 @@ def _list_runs(controller: Controller, part: _Record) -> list[slice]:
 
 def _measure(controller: Controller, part: _Record) -> list[ResidualResponse]:
     """Return the response of a record, up to where a law's loop can be told from it."""
-    log, command, runs = part.experiment.log, log_input(controller, part), _list_runs(controller, part)
+    log, command, runs = part.experiment.log, _read_command(controller, part), _list_runs(controller, part)
     if not runs or np.ptp(np.concatenate([command[run] for run in runs])) == 0.0:
         return []
     return measure_residual(
@@ -183,7 +183,7 @@ def _measure(controller: Controller, part: _Record) -> list[ResidualResponse]:
     )
 
 
-def log_input(controller: Controller, part: _Record) -> Any:
+def _read_command(controller: Controller, part: _Record) -> Any:
     """Return what the log has of the command."""
     return part.experiment.log[controller.command.input]
 
@@ -292,7 +292,7 @@ def _judge(controller: Controller, params: ParameterSet, part: _Record, limit: f
         ms_least=least,
         ms_predicted=float(1.0 / surest.predicted[at]),
         confidence=None if not independent else 1.0 - (REFUTE if refuted else CONFIRM),
-        amplitude=float(np.nanstd(log_input(controller, part)[part.rows])),
+        amplitude=float(np.nanstd(_read_command(controller, part)[part.rows])),
         unit=controller.command.unit,
         at_amplitude=_is_dry(params, part),
     )
