@@ -68,12 +68,21 @@ KINDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Actuator:
-    """An actuator of a kind, with its link held or a pendulum, and effects by name and size (1: as in truth.md)."""
+    """An actuator of a kind, with its link held or a pendulum, and effects by name and size (1: as in truth.md).
+
+    One that is `smooth` has no dry friction.
+    """
 
     kind: str
     link: str = "locked"
     effects: Mapping[str, float] = field(default_factory=dict)
     delay_s: float = 0.0013
+    smooth: bool = False
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """The kind's parameters."""
+        return {**KINDS[self.kind].values} | ({"f_c": 0.0} if self.smooth else {})
 
     @property
     def truth(self) -> Mapping[str, float]:
@@ -82,7 +91,7 @@ class Actuator:
         Of friction that depends on the direction it is the mean of both: a symmetrical model can have no other.
         """
         of_mean = {"direction": "f_c", "viscous_direction": "b_r"}
-        values = dict(KINDS[self.kind].values)
+        values = dict(self.values)
         for effect, name in of_mean.items():
             values[name] *= 1.0 + 0.5 * ASYMMETRY * self.effects.get(effect, 0.0)
         return values
@@ -118,7 +127,7 @@ class Actuator:
         kind = KINDS[self.kind]
         if self.link == "locked":
             return kind.current
-        v = kind.values
+        v = self.values
         weight = v["m"] * v["g"] * v["L"]
         return min(kind.current, (0.4 * weight + 2.0 * v["f_c"] * v["N"]) / (v["eta"] * v["K_tau"] * v["N"]))
 
@@ -161,7 +170,7 @@ class Actuator:
 
 def _list_parameters(actuator: Actuator) -> dict[str, float]:
     """Return the parameters of actuator.c."""
-    kind, v = KINDS[actuator.kind], KINDS[actuator.kind].values
+    kind, v = KINDS[actuator.kind], actuator.values
     if kind.linear:
         per = v["l"] / (2 * np.pi * v["N_p"])
         base = {

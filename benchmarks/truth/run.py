@@ -1,13 +1,13 @@
 """How often a met fit is right where the actuator is not the model: `make truth [ARGS="--fits 60 --seed 7"]`.
 
 Each case is an actuator of `actuators.py` with none, one or two effects that the fitted model lacks. It is fitted as
-its user would fit it: friction that sticks, a free delay, values off by up to a factor of two; to one log at full
-amplitude, or (--logs 2) to that and one at half of it. A fit that is not met is made again as it advises, up to three
-times: with the parts that `seaopt fit --explain` would add, or with the log at half the amplitude that it asks for. A
-fit is *bad* where it is met and has a parameter both 3 % off and outside 4 standard deviations of its 95 % interval,
-that of noise and model. Each case runs in a process of its own with a bound on its processor time; no new ones begin
-after --minutes of it together. Tables are printed, and with --json FILE every case is kept; --read FILE... prints the
-tables of what was kept.
+its user would fit it: friction that sticks (--smooth: none), a free delay, values off by up to a factor of two; to
+one log at full amplitude, or (--logs 2) to that and one at half of it. A fit that is not met is made again as it
+advises, up to three times: with the parts that `seaopt fit --explain` would add, or with the log at half the
+amplitude that it asks for. A fit is *bad* where it is met and has a parameter both 3 % off and outside 4 standard
+deviations of its 95 % interval, that of noise and model. Each case runs in a process of its own with a bound on its
+processor time; no new ones begin after --minutes of it together. Tables are printed, and with --json FILE every case
+is kept; --read FILE... prints the tables of what was kept.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
 
     rng, kind = np.random.default_rng(seed), KINDS[actuator.kind]
     base = so.plants.high_impedance() if kind.linear else so.plants.rotary(link=actuator.link)
-    plant = so.plants.let_stick(base)
+    plant = base if actuator.smooth else so.plants.let_stick(base)
     truth = actuator.find_truth(seconds=seconds, seed=seed)
     known = {name: value for name, value in truth.items() if name in plant.parameters}
-    free = FREE[kind.linear]
+    free = tuple(name for name in FREE[kind.linear] if name != "f_c" or not actuator.smooth)
     guess = {name: known[name] * 2.0 ** rng.uniform(-1, 1) for name in free}
     params = plant.defaults.update(**known | guess).free(*free)
     delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
@@ -285,6 +285,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=60.0, help="processor time of a fit, s")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--exact", action="store_true", help="nothing is missing from any model")
+    parser.add_argument("--smooth", action="store_true", help="no dry friction, and none is fitted")
     parser.add_argument("--logs", type=int, default=1, choices=(1, 2), help="2: a second one at half the amplitude")
     parser.add_argument("--locked", action="store_true", help="links held: no pendulums, whose fits take long")
     parser.add_argument("--json", type=Path)
@@ -297,6 +298,7 @@ def main() -> None:
     cases = list(draw_cases(options.first + options.fits, np.random.default_rng(options.seed), locked=options.locked))
     if options.exact:
         cases = [replace(case, effects={}) for case in cases]
+    cases = [replace(case, smooth=options.smooth) for case in cases]
     jobs = [
         (case, 1000 * options.seed + k, options.seconds, options.logs, options.limit) for k, case in enumerate(cases)
     ][options.first :]
