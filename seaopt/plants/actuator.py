@@ -340,6 +340,7 @@ def make_plant(
             deflection=deflection,
             unit=place,
             stiffness=drive.stiffness,
+            pull=lambda x, p: _find_pull(actuator, x, p),
             mass=second_order[0] if second_order else None,
             damping=second_order[1] if second_order else None,
             damper=drive.spring_damping if actuator.damped_spring else None,
@@ -358,6 +359,12 @@ def _rest(actuator: Actuator) -> SimpleNamespace:
     return SimpleNamespace(**dict.fromkeys(("I", actuator.transmission.friction, SPRING_SLIP), 0.0))
 
 
+def _find_pull(actuator: Actuator, x: Any, p: Any) -> Any:
+    """Return the force of the spring with its damper's, and that of what gives way in it."""
+    force = solve_motion(actuator, x, _rest(actuator), p).spring_force
+    return force + p.k_h * getattr(x, SLIPPING) if "hysteresis" in actuator.parts else force
+
+
 def _list_frictions(actuator: Actuator, states: Collection[str], names: Sequence[str]) -> dict[str, Friction]:
     """Return what rubs: the drive, and within a spring with hysteresis what gives way. `states` are those of the
     motion, `names` those of the parameters.
@@ -366,9 +373,7 @@ def _list_frictions(actuator: Actuator, states: Collection[str], names: Sequence
     slips = (SLIPPING,) if "hysteresis" in parts else ()
 
     def read_loads(x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        spring = solve_motion(actuator, x, _rest(actuator), p).spring_force
-        spring += p.k_h * x.z_h if slips else 0.0
-        return {"motor": drive.per_ampere(p) * u.I, "output": drive.travel(p) * spring}
+        return {"motor": drive.per_ampere(p) * u.I, "output": drive.travel(p) * _find_pull(actuator, x, p)}
 
     # Stored, it takes expressions for the states, which the derivatives in `solve_motion` do not.
     loads = store_function(read_loads, (*states, *slips), ("I",), names) if "load_friction" in parts else None

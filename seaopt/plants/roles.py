@@ -78,6 +78,10 @@ class SeriesSpring:
     deflection: StateExpression = option("How far it is deflected, in terms of states and parameters.")
     unit: str = option("Of the deflection: m or rad.")
     stiffness: str | None = option("Parameter that is its stiffness, where one is.", default=None)
+    pull: StateExpression | None = option(
+        "What it pulls with, in terms of states and parameters; stiffness times deflection if left out.",
+        default=None,
+    )
     mass: str | None = option(
         "Derived figure: what swings on the spring, which (16) of Orekhov et al. 2015 reads from a second-order "
         "response with k known.",

@@ -84,7 +84,7 @@ def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) 
         optional_inputs=frozenset(table.optional_inputs),
         actuation=texts.make(Actuation, "actuation", table.actuation, "effort", "speed", "largest"),
         sensing=texts.make(Sensing, "sensing", table.sensing),
-        spring=texts.make(SeriesSpring, "spring", table.spring, "deflection"),
+        spring=texts.make(SeriesSpring, "spring", table.spring, "deflection", "pull"),
         ports=tuple(texts.port(f"ports.{number}", port, partners) for number, port in enumerate(table.ports, 1)),
         friction={
             key: texts.make(Friction, f"friction.{key}", curve, *FRICTION_FORMULAS)

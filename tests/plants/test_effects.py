@@ -40,7 +40,7 @@ def _rate(t, x, p):
     rub = dry + viscous + p.get("f_a", 0.0) + p.get("b_a", 0.0) * abs(speed)
     phase = p.get("n_g", 0.0) * angle
     rub += p.get("a_g", 0.0) * math.sin(phase) + p.get("b_g", 0.0) * math.cos(phase)
-    rub += p.get("d_e", 0.0) * k * angle / p["N"] ** 2
+    rub += p.get("d_e", 0.0) * torque / p["N"]
     return speed, (motor - rub - torque / p["N"]) / p["J_m"]
 
 

@@ -83,7 +83,7 @@ def _arrange(layout: Any, leaves: list[Any]) -> Any:
 # velocity v and the deflection of bristles z.
 ARGUMENTS = {
     "f": "txup", "h": "txup", "derived": "p", "energy": "xp",
-    "effort": "p", "speed": "xp", "largest": "p", "deflection": "xp", "ratio": "p",
+    "effort": "p", "speed": "xp", "largest": "p", "deflection": "xp", "pull": "xp", "ratio": "p",
     "velocity": "xp", "force": "vl", "slopes": "l", "jump": "vl", "loads": "xup",
     "coordinate": "xp", "stiffness": "p", "damping": "p", "rate": "zvl",
 }  # fmt: skip

@@ -200,8 +200,8 @@ def let_back_driving_differ(plant: Plant) -> Plant:
     spring, stiffness = _find_spring(plant, "back_driving")
 
     def push(x: Any, u: Any, p: Any) -> SimpleNamespace:
-        effort = getattr(p, stiffness) * spring.deflection(x, p) / friction.effort(p)
-        return with_values(u, {name: getattr(u, name) + p.d_e * effort})
+        pull = getattr(p, stiffness) * spring.deflection(x, p) if spring.pull is None else spring.pull(x, p)
+        return with_values(u, {name: getattr(u, name) + p.d_e * pull / friction.effort(p)})
 
     return _change(plant, "back_driving", (BACK_DRIVING,), push, let_back_driving_differ)
 

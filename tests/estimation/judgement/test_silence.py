@@ -16,10 +16,10 @@ SCREW = {"m_l": 0.646, "k": 655e3, "l": 0.002, "N_p": 3.0, "K_tau": 0.0255, "J":
          "v_s": 2e-3}  # fmt: skip
 
 
-def record(*, linear=False, give=0.0, driving=0.0, driven=0.0, damping=0.0):
+def record(*, linear=False, give=0.0, driving=0.0, driven=0.0, damping=0.0, hardening=0.0, play=0.0):
     """Return the log of a motor on a held spring, in series with a stand that gives by a share of the spring; friction
     grows by shares of the spring's effort, where the motor drives it and where it drives the motor. `damping` is a
-    damper's across a gear's spring.
+    damper's across a gear's spring, which hardens by a cubic stiffness, behind a play of twice `play`.
     """
     p = SCREW if linear else ROTARY
     t, current = drive(6.0, RATE_HZ, 2.5, seed=1, top_hz=25.0)
@@ -28,9 +28,13 @@ def record(*, linear=False, give=0.0, driving=0.0, driven=0.0, damping=0.0):
     inertia = p["J"] / lead**2 + p["m_l"] if linear else p["J_m"]
     stiffness = spring / (1.0 + give)
 
+    def pull(place):
+        stretch = place / ratio - np.clip(place / ratio, -play, play)
+        return (stiffness * stretch + hardening * stretch**3) / ratio
+
     def rates(x, ampere):
         place, speed = x
-        effort = stiffness * place / ratio**2
+        effort = pull(place)
         level = p["f_c"] + 0.5 * (driving + driven) * abs(effort)
         rub = level * math.tanh(speed / p["v_s"]) + p["b_r"] / lead**2 * speed
         rub += damping / ratio**2 * speed
@@ -38,7 +42,7 @@ def record(*, linear=False, give=0.0, driving=0.0, driven=0.0, damping=0.0):
         return speed, (p["K_tau"] / lead * ampere - rub - effort) / inertia
 
     place, speed = integrate(rates, 2, current, 1.0 / RATE_HZ, 4)
-    noise, effort = np.random.default_rng(2), (stiffness * place + damping * speed) / ratio
+    noise, effort = np.random.default_rng(2), pull(place) * ratio + damping * speed / ratio
     if linear:
         pushed = np.array([rates(x, u)[1] for x, u in zip(zip(place, speed, strict=True), current, strict=True)])
         readings = {"F1": (effort, 1.0), "F2": (effort + p["m_l"] * pushed, 1.0), "q": (place, 1e-7)}
@@ -52,7 +56,9 @@ def fit(log, *, linear=False, parts=(), free=None, **given):
     plant = so.plants.high_impedance(parts=parts) if linear else so.plants.rotary(link="locked", parts=parts)
     names = free or (("J", "b_r", "f_c", "k", "eta") if linear else ("J_m", "b_r", "f_c", "k_s", "eta"))
     params = plant.defaults.update(**(SCREW if linear else ROTARY), **given).free(*names)
-    params = params.update(c_e=0.03).free("c_e") if parts else params
+    starts = {"c_e": 0.03, "k_3": 0.0, "g_b": 0.005}
+    added = {name: value for name, value in starts.items() if name in plant.parameters}
+    params = params.update(**added).free(*added)
     outputs = tuple(name for name in log.signals if name != "I")
     return so.fit([so.Experiment(plant=plant, log=log, outputs=outputs, initial_state="rest")], params)
 
@@ -89,6 +95,18 @@ def test_back_driving_is_said_to_touch_all_that_scales_with_it(linear):
     for name, value in values.items():
         expected = {"eta": 1.0, "c_e": 0.08}.get(name) or truth[name]
         assert value == pytest.approx(expected, rel=0.01), name
+
+
+@pytest.mark.parametrize(("part", "shape"), [("hardening", {"hardening": 2e4}), ("backlash", {"play": 0.01})])
+def test_back_driving_is_said_of_springs_that_are_not_straight(part, shape):
+    """The transmission rubs by what the spring pulls with, not by what a straight one would."""
+    result = fit(record(driving=0.13, driven=0.03, **shape), parts=("load_friction", part))
+    assert result.met
+    values = follow(result, "back_driving", 0.05)
+    assert values.keys() == {"J_m", "b_r", "f_c", "eta", "c_e"}
+    for name, value in values.items():
+        expected = {"eta": 1.0, "c_e": 0.08}.get(name) or ROTARY[name]
+        assert value == pytest.approx(expected, rel=0.02), name
 
 
 def test_a_fixed_damping_of_the_spring_is_said_to_touch_the_motors():
