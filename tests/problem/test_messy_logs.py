@@ -181,9 +181,11 @@ def test_a_supply_is_no_input(tmp_path, held):
 def test_a_temperature_in_degrees_is_no_charge(tmp_path, held):
     t, of = held
     path = write_csv(
-        tmp_path / "warm.csv", {"t [s]": t, "I [A]": of["I"], "tau [N m]": of["tau_s"], "case [C]": 30 + t}
+        tmp_path / "warm.csv",
+        {"t [s]": t, "I [A]": of["I"], "tau [N m]": of["tau_s"], "case [C]": 30 + t, "T_w [C]": 20 + 0.1 * t**2},
     )
-    assert unused_of(propose([path], {}, tmp_path))["case [C]"] == "not used: not a signal of the actuator"
+    unused = unused_of(propose([path], {}, tmp_path))
+    assert unused["case [C]"] == unused["T_w [C]"] == "not used: not a signal of the actuator"
     assert so.logs.read_table(path).signals["case"].unit == "degC"
 
 

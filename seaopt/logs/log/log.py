@@ -454,7 +454,7 @@ def _measure_steps(time: Float[np.ndarray, " n"]) -> tuple[float, float]:
         count += short.size
     if time.size - 1 - count > OFTEN * (time.size - 1):
         return measure_steps(np.diff(time))
-    return total / count, GAP * total / count
+    return total / count, max(GAP * total / count, longest)
 
 
 def _array(name: str, values: Any, source: str) -> Float[np.ndarray, " n"]:

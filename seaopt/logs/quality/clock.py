@@ -110,7 +110,7 @@ def measure_steps(step: Float[np.ndarray, " n"]) -> tuple[float, float]:
             longest = LONG * float(np.quantile(step, 1.0 - OFTEN))
             return float(np.mean(step[step <= longest])), longest
     period = float(np.mean(step[short]))
-    return period, GAP * period
+    return period, GAP * max(period, usual)  # where most steps are the long ones, these are no gaps
 
 
 def split_at_gaps(time: Float[np.ndarray, " n"], longest_step: float) -> list[slice]:

@@ -185,9 +185,12 @@ def _read_header(name: str, unit: str | None, *, odd: bool) -> Header:
 
 
 def _is_time(header: Header, values: Float[np.ndarray, " n"]) -> bool:
-    """Tell whether a column is a time by its name, or the beginning of it and its samples: t_cell, not t_winding."""
+    """Tell whether a column is a time by its name, or the beginning of it and its samples: t_cell, not t_winding, and
+    not T_w in degrees, which may only rise as well.
+    """
     rows = _count_rows(values)
-    return rows > 1 and (header.quantity == "time" or (is_named_time(header.name) and runs_on(values[:rows])))
+    begins = not header.unit and is_named_time(header.name)
+    return rows > 1 and (header.quantity == "time" or (begins and runs_on(values[:rows])))
 
 
 def _read_raw(path: Path, fields: Mapping[str, Field]) -> dict[str, Float[np.ndarray, " n"]]:
