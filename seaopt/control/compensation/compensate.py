@@ -17,7 +17,6 @@ from seaopt.control.loops.compensation.terms import (
     CompensateGravity,
     Compensation,
     FrictionTerm,
-    GravityTerm,
 )
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.errors import ControlError
@@ -79,23 +78,14 @@ def add_compensation(
     added = Compensation(
         sample_time_s=controller.sample_time_s,
         friction=None if friction is None else _meet_friction(controller, *controller.design, friction),
-        gravity=None if gravity is None else _meet_gravity(controller, *(link or controller.design), gravity),
+        gravity=None
+        if gravity is None
+        else make_gravity_term(*(link or controller.design), controller.spec.regulated, gravity),
         ripple=None
         if ripple is None
         else make_ripple_term(controller.design[0], controller.command.per_effort, ripple),
     )
     return replace(controller, compensation=added)
-
-
-def _meet_gravity(
-    controller: Controller, plant: Plant, params: ParameterSet, gravity: CompensateGravity
-) -> GravityTerm:
-    if controller.outer is not None and not controller.outer.stiffness:
-        raise ControlError(
-            "compensate.gravity with an [impedance] without stiffness is not computed; give a stiffness, or leave "
-            "[impedance] out"
-        )
-    return make_gravity_term(plant, params, controller.spec.regulated, gravity)
 
 
 def _meet_friction(

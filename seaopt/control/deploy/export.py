@@ -433,7 +433,7 @@ def _numbers(stored: Mapping[str, Any], law: RunnableLaw, number: Callable[[floa
     }
 
 
-def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, str]:
+def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, Any]:
     """Return the numbers of the outer loop as text, its direction in the gains."""
     return {
         "stiffness": number(outer.direction * outer.stiffness),
@@ -442,6 +442,7 @@ def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, 
         "pole": number(outer.pole),
         "rate": number(outer.rate),
         "place_unit": outer.place_unit,
+        "pushed": not outer.stiffness,
         "shown_stiffness": f"{outer.stiffness:.6g}",
         "shown_damping": f"{outer.damping:.6g}",
     }

@@ -115,7 +115,8 @@ class Guarded:
     compensation : Compensation, optional
         What is added to reference and effort; it may read further outputs.
     outer : OuterLoop, optional
-        What makes the law's reference of an x_0, then the reference of every method, and of the link's position.
+        What makes the law's reference of an x_0, then the reference of every method, and of the link's position. One
+        without a stiffness adds damping to the reference, which stays a force.
     """
 
     sample_time_s: float
@@ -169,7 +170,8 @@ class Guarded:
         added = 0.0
         if self.outer is not None:
             (position,) = self._take(readings, self.outer.position) if readings else (0.0,)
-            *_, reference = follow_link(self.outer.numbers, FIRST, reference, position)
+            place, force = self.outer.split(reference)
+            reference = force + follow_link(self.outer.numbers, FIRST, place, position)[-1]
         if self.compensation is not None:
             reads = self._take_terms(readings) or (0.0,) * len(self.compensation.reads)
             reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads, numbers)
@@ -224,9 +226,10 @@ class Guarded:
         """
         if self.outer is not None:
             (position,), outer = self._take(readings, self.outer.position), state.outer
-            if is_number(reference) and is_number(position):
-                outer = follow_link(self.outer.numbers, outer, reference, position)
-            noted["outer"], reference = outer, outer[-1]
+            place, force = self.outer.split(reference)
+            if is_number(place) and is_number(position):
+                outer = follow_link(self.outer.numbers, outer, place, position)
+            noted["outer"], reference = outer, force + outer[-1]
         if self.heat is None:
             return self._decide(state, reference, measurement, readings, self.command_limit, advance, numbers, noted)
         limit = min(self.command_limit, self.heat.limit(state.heat))
@@ -402,7 +405,7 @@ def runnable(
     heat : HeatGuard or False, optional
         What lowers the limit as the winding warms up; `controller.heat_guard` if left out and the controller derates.
     outer : bool
-        With the controller's outer loop, where it has one that renders a stiffness: the reference then is x_0.
+        With the controller's outer loop, where it has one: the reference then is x_0, or without a stiffness a force.
 
     Raises
     ------
@@ -428,7 +431,7 @@ def runnable(
         heat=(controller.heat_guard if controller.derate else None) if heat is None else heat or None,
         compensation=controller.compensation,
     )
-    return replace(law, outer=controller.outer) if outer and controller.renders else law
+    return replace(law, outer=controller.outer) if outer else law
 
 
 def wind_up(controller: Mapping[str, Any], tracking_time_s: float | None) -> dict[str, Any]:

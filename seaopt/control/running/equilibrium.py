@@ -76,7 +76,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
         given = reference
         if law.outer is not None:
             position = float(y[names.index(law.outer.position)]) if law.outer.position in names else 0.0
-            given = position + reference / (law.outer.direction * law.outer.stiffness)
+            given = law.outer.split(position)[0] + reference / law.outer.per_given
         forgotten = np.zeros(loop.law_states - inner.size - 1)
         z[run] = np.concatenate([inner, forgotten, np.full(1 + loop.waiting, u[0])])
         figures[run] = reference, given, force, u[0], 0.0 if plant.energy is None else y[-1]

@@ -46,6 +46,7 @@ class LawShape:
     holds: bool = True  # the last command where an input is not a number
     encoders: tuple[str, ...] = ()  # that the gate reads
     position: str = ""  # that the outer loop reads, where there is one
+    pushed: bool = False  # it has no stiffness, so that the reference is a force
 
     @classmethod
     def of_law(cls, law: RunnableLaw | RunnableSchedule) -> LawShape:
@@ -61,6 +62,7 @@ class LawShape:
             schedule=schedule,
             encoders=() if law.gate is None else law.gate.reads,
             position="" if law.outer is None else law.outer.position,
+            pushed=law.outer is not None and not law.outer.stiffness,
         )
 
     @property
@@ -191,10 +193,11 @@ def express_step(
     x, memory, seen, rises, at, outer, last = ca.vertsplit(kept, np.cumsum([0, *shape.sizes]).tolist())
     if shape.position:
         position = further[shape.further.index(shape.position)]
-        moved = ca.vertcat(*follow_link(ca.vertsplit(around), ca.vertsplit(outer), reference, position))
+        x_0, force = (0.0, reference) if shape.pushed else (reference, 0.0)
+        moved = ca.vertcat(*follow_link(ca.vertsplit(around), ca.vertsplit(outer), x_0, position))
         if shape.holds:
-            moved = ca.if_else(ca.logic_and(_is_number(reference), _is_number(position)), moved, outer)
-        outer, reference = moved, moved[-1]
+            moved = ca.if_else(ca.logic_and(_is_number(x_0), _is_number(position)), moved, outer)
+        outer, reference = moved, force + moved[-1]
     fault, known, measured, memory, rises = 0.0, 1.0, list(measured), ca.vertsplit(memory), ca.vertsplit(rises)
     if shape.gated:
         encoders = [further[shape.further.index(name)] for name in shape.encoders]

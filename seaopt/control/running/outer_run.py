@@ -2,12 +2,11 @@ r"""An impedance's outer loop and the force law behind it as one linear law, for
 
 With :math:`s` the state of the outer loop's filtered speed (`seaopt.control.loops.outer_loop`), the force law's
 reference is :math:`\sigma K_v x_0 - \sigma (K_v + D_v \rho) x - \sigma D_v s`, :math:`\rho` the filter's rate. Put into
-the force law it gives a law of the reference x_0 and of the link's position beside what it measures itself.
+the force law it gives a law of the reference x_0 and of the link's position beside what it measures itself; without
+stiffness, of a force in place of x_0, to which the damping is added.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -32,7 +31,7 @@ def enclose_law(law: Law, outer: OuterLoop, place: int | None = None) -> Law:
     b[:, column] -= (stiffness + damping * rate) * drive
     b[n, column] += (pole - 1.0) * rate
     d[column] -= (stiffness + damping * rate) * through
-    b[:, 0], d[0] = stiffness * drive, stiffness * through
+    b[:, 0], d[0] = outer.per_given * drive, outer.per_given * through
     a = np.block([[law.a, -damping * law.b[:, :1]], [np.zeros((1, n)), np.full((1, 1), pole)]])
     return Law(a=a, b=b, c=np.append(law.c, -damping * through), d=d, sample_time_s=law.sample_time_s)
 
@@ -45,11 +44,6 @@ def enclose(controller: Controller, plant: Plant) -> tuple[Law, tuple[str, ...]]
     if outer.position in signals:
         return enclose_law(controller.law, outer, signals.index(outer.position)), signals
     return enclose_law(controller.law, outer), (*signals, outer.position)
-
-
-def enclose_running(controller: Controller, plant: Plant) -> tuple[Law, tuple[str, ...]]:
-    """Return the same of the law that runs in scenarios, which has no outer loop without stiffness."""
-    return enclose(controller if controller.renders else replace(controller, outer=None), plant)
 
 
 def close(controller: Controller, plant: Plant, params: ParameterSet, enclosed: tuple[Law, tuple[str, ...]]) -> Loop:

@@ -236,7 +236,7 @@ class ScheduledController(Result, Worded):
         tracking_time_s : float, optional
             Of the anti-windup.
         outer : bool
-            With its outer loop, where it has one that renders a stiffness.
+            With its outer loop, where it has one.
         """
         first = self.controllers[0]
         law = make_runnable(
@@ -248,7 +248,7 @@ class ScheduledController(Result, Worded):
             command=(self.command.input, self.command.unit),
             compensations=[each.compensation for each in self.controllers],
         )
-        around = first.outer if outer and first.renders else None
+        around = first.outer if outer else None
         return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None, outer=around)
 
     def to_dict(self) -> dict[str, Any]:

@@ -295,19 +295,20 @@ class _Case:
         return _Outcome(kind=kind, text=text, violation=violation, signal=signal, ring=ring, at_limit=at_limit)
 
     def _simulate(self, steps: list[MPCStep]) -> ForceRun:
-        """Return the samples of the run, and add each step of the law to `steps`. An outer loop is given the x_0 that
-        its stiffness makes the reference of, and asks for the force of one sample: with it there is no preview.
+        """Return the samples of the run, and add each step of the law to `steps`. An outer loop is given what it makes
+        the reference of, an x_0 or a force, and asks for the force of one sample: with it there is no preview.
         """
         mpc = self.bench.mpc
-        outer = mpc.outer if self.bench.law.renders else None
+        outer = mpc.outer
         moved = outer is not None and outer.position in self.plant.outputs
 
         def law(state: Any, r: Any, y: Any) -> tuple[float, Any]:
             plan, kept = state
             if outer is not None:
                 y, position = y if moved else (y, 0.0)
-                kept = follow_link(outer.numbers, kept, r / (outer.direction * outer.stiffness), float(position))
-                r = kept[-1]
+                place, force = outer.split(r / outer.per_given)
+                kept = follow_link(outer.numbers, kept, place, float(position))
+                r = force + kept[-1]
             steps.append(mpc.step(plan, r, float(y)))
             return steps[-1].current_A, (steps[-1].state, kept)
 
@@ -387,7 +388,7 @@ class _Case:
         mpc, lowest_hz = self.bench.mpc, SLOWEST * self.bench.mpc.spec.bandwidth_hz
         judged = round(JUDGED_PERIODS / mpc.spec.bandwidth_hz * mpc.spec.sample_rate_hz)
         force = run.force[-judged:]
-        if self.bench.law.renders:
+        if mpc.outer is not None:
             poles = view.loop.eigenvalues()
             rates: Any = np.log(poles[np.abs(poles) > FORGOTTEN])
             slow = rates[(rates.imag >= 0.0) & (rates.imag < 2.0 * np.pi * lowest_hz * mpc.sample_time_s)]

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from seaopt.control.loops.loop import STABLE, Loop
-from seaopt.control.running.outer_run import close, enclose_running
+from seaopt.control.loops.loop import GROWING, STABLE, Loop
+from seaopt.control.running.outer_run import close, enclose
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -32,6 +32,7 @@ class LinearView:
     loop: Loop
     noise: tuple[float, ...]  # std of the white noise that represents each sensor, the regulated one's first
     step_N: float  # the same of the rounded current
+    drifts: bool = False  # nothing holds the link that an outer loop reads, whose damping alone leaves it where it is
 
     @property
     def instability(self) -> str:
@@ -39,7 +40,7 @@ class LinearView:
         poles, period = self.loop.eigenvalues(), self.loop.plant.sample_time_s
         fastest = poles[np.argmax(np.abs(poles))] if poles.size else 0.0
         radius = abs(fastest)
-        if radius < STABLE:
+        if radius < STABLE or (self.drifts and radius <= GROWING):
             return ""
         if not math.isfinite(radius):
             return "unstable: the linear loop has an eigenvalue that is not finite"
@@ -75,12 +76,13 @@ def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) 
 
 def view_loop(stage: Stage, plant: Plant, params: ParameterSet) -> LinearView:
     """Return the linear loop on a plant at rest, with the noise of a stage's devices."""
-    controller = stage.controller
-    enclosed = enclose_running(controller, plant)
+    controller, outer = stage.controller, stage.controller.outer
+    enclosed = enclose(controller, plant)
     return LinearView(
         loop=close(controller, plant, params, enclosed),
         noise=tuple(_combine_std(*stage.find_errors(name)) for name in enclosed[1]),
         step_N=_combine_std(0.0, stage.command_step / controller.command.per_effort),
+        drifts=outer is not None and not outer.stiffness,
     )
 
 

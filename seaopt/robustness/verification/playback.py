@@ -140,7 +140,8 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     its parameters (an angle such as phi) puts the plant, with the law and the commands that wait at rest too, and the
     scenario's forces counted from the one that keeps it there. A scenario with an `initial_state` starts in that,
     whatever the conditions. `delay_s` among the parameters is a delay besides the controller's. `seed` is of the sensor
-    noise and of random excitations. Around an outer loop a force of a phase is the x_0 that its stiffness makes it of.
+    noise and of random excitations. Around an outer loop a force of a phase is the x_0 that its stiffness makes it of;
+    without a stiffness it is added to what that asks for.
     """
     obstacle = scenario.obstacle(stage.plant, stage.partner)
     if obstacle is not None:
@@ -155,7 +156,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     now, grip = _start_state(stage, scenario, placed, longest) if rest is None else rest.state, None
     offset = rest.given[:, None] if rest is not None and scenario.about_rest else np.zeros((len(params), 1))
     outer = stage.law.outer
-    per_force = 1.0 if outer is None else 1.0 / (outer.direction * outer.stiffness)
+    per_force = 1.0 if outer is None else 1.0 / outer.per_given
     runs: list[LoopRun] = []
     positions: list[RunSamples] = []  # of the link, as the outer loop reads it
     contacts: list[Contact] = []
@@ -194,7 +195,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
             still = dict(zip(loop.standing, standing.T, strict=False)).get(outer.position, np.zeros(1))
             positions.append(run.outputs.get(outer.position, np.broadcast_to(still[:, None], run.reference.shape)))
     played = _join_phases(stage, runs, rest, tuple(contacts))
-    return played if outer is None else replace(played, reference=outer.run(played.reference, np.hstack(positions)))
+    return played if outer is None else replace(played, reference=outer.ask(played.reference, np.hstack(positions)))
 
 
 def _start_state(stage: Stage, scenario: Scenario, values: Sequence[CompletedParameters], longest: float) -> LoopState:

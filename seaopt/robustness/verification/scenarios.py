@@ -14,7 +14,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.limits import BY_NAME, STEADY, STEADY_PERIODS
 from seaopt.control.laws.realisation import RunnableLaw, runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
-from seaopt.control.running.outer_run import close, enclose_running
+from seaopt.control.running.outer_run import close, enclose
 from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
@@ -239,7 +239,7 @@ def default_scenarios(controller: Controller, plant: Plant, sets: Sequence[Param
         heavy, light = (dict.fromkeys(plant.port.payload, factor) for factor in (1.5, 1 / 1.5))
         add("payload", push, Phase(duration_s=lasting, scale=heavy), Phase(duration_s=tail, scale=light), on="free")
     angle = _lever(plant)
-    # Let go above the horizontal: the arm L_a cos(phi) vanishes at 90 degrees and changes sign. One that an outer loop
+    # Let go above the horizontal: the arm L_a cos(phi) vanishes at 90 degrees and changes sign. One that a stiffness
     # pulls on does not fall.
     if angle is not None and not controller.renders:
         start, horizontal = {angle: math.radians(FALL_DEG)}, {angle: math.pi / 2}
@@ -415,7 +415,7 @@ def _lever(plant: Plant) -> str | None:
 def _size_last_phase(controller: Controller, plant: Plant) -> float:
     """Return the duration of a last phase: long enough for the loop's slowest swing, and for slow limit cycles."""
     _, params = _require_design(controller)
-    loop = close(controller, take_sliding(plant, params), params, enclose_running(controller, plant))
+    loop = close(controller, take_sliding(plant, params), params, enclose(controller, plant))
     poles = np.log(loop.eigenvalues() + 1e-300) / controller.sample_time_s
     swinging = np.abs(poles.imag[np.abs(poles.imag) > np.abs(poles.real)])
     slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0

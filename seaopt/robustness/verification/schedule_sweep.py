@@ -277,9 +277,10 @@ class RestStart:
         reference = float(fed[0]) - _weigh(law, named, value)
         given = reference + references
         if law.outer is not None:
-            per_force = 1.0 / (law.outer.direction * law.outer.stiffness)
-            reference = per_force * reference + self.readings.get(law.outer.position, 0.0)
-            given = reference + per_force * references + _travel(plant, law.outer, values, references.shape[1])
+            place, _ = law.outer.split(self.readings.get(law.outer.position, 0.0))
+            travelled, _ = law.outer.split(_travel(plant, law.outer, values, references.shape[1]))
+            reference = reference / law.outer.per_given + place
+            given = reference + references / law.outer.per_given + travelled
         kept = list_kept(law, law.reset(reference, fed, value, self.command, readings=further))
         x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]
         count = len(references)
@@ -290,7 +291,7 @@ class RestStart:
         """Return how far the output is from what the law follows, the weight that it compensates included."""
         law, followed = self.schedule.runnable(outer=True), run.reference
         if law.outer is not None:
-            followed = law.outer.run(followed, run.outputs.get(law.outer.position, np.zeros_like(followed)))
+            followed = law.outer.ask(followed, run.outputs.get(law.outer.position, np.zeros_like(followed)))
         errors = run.outputs[self.regulated] - followed
         if law.compensation is None or law.compensation.gravity is None:
             return errors

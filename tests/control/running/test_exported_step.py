@@ -93,7 +93,7 @@ def change_terms(terms, rng):
 def draw_part(number, rng):
     """Return a law, the same with random parts and limit, and its outer loop or None; `number`: of its structure."""
     shape, outer = np.random.default_rng(number), draw_outer(rng)
-    outer = outer if shape.random() < 0.3 else None
+    outer = replace(outer, stiffness=outer.stiffness * (number % 2)) if shape.random() < 0.3 else None
     guards = draw_guards(shape, rng)
     source, terms = draw_law(shape, rng), draw_terms(shape, rng, outer)
     return source, realise(source, per_effort=PER_EFFORT, compensation=terms, **guards), outer
@@ -104,6 +104,12 @@ def draw_outer(rng):
         stiffness=rng.uniform(100, 2000), damping=rng.uniform(0, 20), velocity_filter_s=rng.choice([0.0, 0.004]),
         direction=float(rng.choice([-1.0, 1.0])), sample_time_s=TS, place_unit="m", position="x",
     )  # fmt: skip
+
+
+def draw_damping(number, rng):
+    """Return an outer loop of every third schedule, half of them without stiffness."""
+    outer = draw_outer(rng)
+    return replace(outer, stiffness=outer.stiffness * (number % 6 == 0)) if number % 3 == 0 else None
 
 
 def draw_guards(shape, rng):
@@ -203,6 +209,8 @@ def export_all(compiler, parts, controller, folder, monkeypatch):
         export(stored, folder, name=name, gate=law.gate or False, derate=law.heat or False, command_limit=limit)
         given = "".join(f", in[{i}]" for i in range(1, inputs))
         asked = "in[0]" if outer is None else f"{name}_outer(&law, in[0], in[{inputs}])"
+        if outer is not None and not outer.stiffness:
+            asked = f"in[0] + {name}_outer(&law, 0.0, in[{inputs}])"
         code.append(f'#include "{name}.h"\nvoid run{number}(const double *in, size_t n, double *out) {{')
         code.append(f"    {name}_law law;\n    size_t i;\n    {name}_init(&law);")
         code.append(f"    for (i = 0; i < n; i++, in += {inputs + (outer is not None)})")
@@ -230,7 +238,7 @@ def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tune
     rng, plant = np.random.default_rng(count), make_plant()
     parts = [draw_part(number % STRUCTURES, rng) for number in range(count)]
     parts += [
-        (None, draw_schedule((33 + number) % (STRUCTURES // 2), rng), draw_outer(rng) if number % 3 == 0 else None)
+        (None, draw_schedule((33 + number) % (STRUCTURES // 2), rng), draw_damping(number, rng))
         for number in range(count // 2)
     ]
     play_c = export_all(compiler, parts, tuned, tmp_path, monkeypatch)
@@ -238,7 +246,7 @@ def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tune
     for number, (_, force_law, outer) in enumerate(parts):
         names, law, places = ("F", "G", "H")[: force_law.measured], replace(force_law, outer=outer), None
         loop = SampledLoop(plant=plant, law=law, measured=names, delay_samples=0)
-        signals = draw_signals(rng, loop.signals, outer is not None)
+        signals = draw_signals(rng, loop.signals, outer is not None and outer.stiffness > 0.0)
         reference, *noise = signals.values()
         if isinstance(law, RunnableSchedule):
             places = 1.5 * np.sin(0.03 * np.arange(SAMPLES) + rng.uniform(0.0, 6.0))

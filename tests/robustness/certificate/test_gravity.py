@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import seaopt as so
 from seaopt.control import (
@@ -15,6 +16,7 @@ from seaopt.control import (
     run_loop,
     runnable,
 )
+from seaopt.files import to_json
 from seaopt.robustness.certificate import compensation
 from seaopt.robustness.certificate.compensation import NEUTRAL, choose_worst, measure_gravity
 
@@ -52,6 +54,24 @@ def test_eigenvalue_has_the_damping_of_an_impedance_without_stiffness(plain):
     rate = (-5.5 + np.sqrt(5.5**2 - 4.0 * 0.3 * left)) / 0.6
     assert (find(1.2, 5.0) - 1.0) / 1e-3 == pytest.approx(rate, rel=0.05)
     assert find(0.8, 200.0) > 1.0  # more than the force loop renders
+
+
+def test_damping_and_weight_act_alike_in_either_order(plain):
+    damping = Impedance(stiffness=0.0, damping=5.0)
+    orders = (
+        add_impedance(compensate(plain, 0.9), KNEE, VALUES, damping),
+        compensate(add_impedance(plain, KNEE, VALUES, damping), 0.9),
+    )
+    assert to_json(orders[0].to_dict()) == to_json(orders[1].to_dict())
+    loop = SampledLoop(plant=KNEE, law=runnable(orders[1], outer=True), measured="tau_s", delay_samples=1)
+    turned = run_loop(loop, [VALUES], np.full(3000, 0.5)).outputs["theta_l"][0]
+
+    def move(t, x):  # the link, whose torque follows at once
+        return x[1], (0.5 - 5.0 * x[1] - 0.5 * x[1] - 0.1 * 4.0 * 9.81 * 0.2 * np.sin(x[0])) / 0.3
+
+    t = 1e-3 * np.arange(3000)
+    expected = solve_ivp(move, (0.0, t[-1]), (0.0, 0.0), t_eval=t, rtol=1e-8).y[0]
+    np.testing.assert_allclose(turned, expected, atol=0.02 * expected[-1])
 
 
 def test_a_link_that_weighs_less_than_is_compensated_is_found(plain):

@@ -222,12 +222,13 @@ def test_what_cannot_be_is_said_in_one_line(mpc, stand, thor):
             so.certify(mpc, {"stand": stand}, thor, **options)
 
 
-def test_runs_with_limits_active_have_the_outer_loop(monkeypatch):
+@pytest.mark.parametrize("stiffness", [40.0, 0.0])
+def test_runs_with_limits_active_have_the_outer_loop(monkeypatch, stiffness):
     """Each command is that of the plan, of the force that stiffness and damping ask where the link of the run was."""
     held, free = so.plants.rotary("locked"), so.plants.rotary()
     values = free.defaults.update(N=100.0, K_tau=0.0369, eta=0.7, J_m=2.4e-5, b_r=1e-4, k_s=300.0, J_l=0.25, d_l=0.3)
     mpc = force_mpc(held, values, MPCSpec(measured="tau_s", current_limit_A=8.0, bandwidth_hz=12, preview_samples=5))
-    asked = Impedance(stiffness=40.0, damping=2.0, velocity_filter_s=5e-3)
+    asked = Impedance(stiffness=stiffness, damping=2.0, velocity_filter_s=5e-3)
     mpc = replace(mpc, outer=add_impedance(linear_controller(mpc), free, values, asked, name="free").outer)
     runs, play = [], constrained.close_loop
     monkeypatch.setattr(constrained, "close_loop", lambda *a, **k: runs.append(play(*a, **k)) or runs[-1])
@@ -239,5 +240,5 @@ def test_runs_with_limits_active_have_the_outer_loop(monkeypatch):
     state, before, speed = mpc.start, places[0], 0.0
     for wanted, place, torque, current in zip(run.reference, places, run.force, run.current, strict=True):
         speed, before = (5e-3 * speed + place - before) / (5e-3 + TS), place
-        command, state = mpc.command(state, wanted - 40.0 * place - 2.0 * speed, torque)
+        command, state = mpc.command(state, wanted - stiffness * place - 2.0 * speed, torque)
         assert command == pytest.approx(current, abs=1e-9)

@@ -32,6 +32,12 @@ def knee(force):
     return add_impedance(force, FREE, VALUES, ASKED, name="free")
 
 
+@pytest.fixture(scope="module")
+def damped(force):
+    """Return a law with an outer loop of damping alone."""
+    return add_impedance(force, FREE, VALUES, replace(ASKED, stiffness=0.0), name="free")
+
+
 def sample_joint():
     """Return the sampled motor and link, from command to their next state."""
     v = {name: VALUES[name].value for name in VALUES}
@@ -45,25 +51,28 @@ def sample_joint():
     return whole[:4, :4], whole[:4, 4], np.array([k / n, c / n, -k, -c])
 
 
-def simulate(controller, wanted):
-    """Return torque, its reference and the link's position under references of the link's position."""
+def simulate(controller, wanted, added=None):
+    """Return torque, its reference and the link's position under references of the link's position. `added`: torques
+    asked for beside damping alone.
+    """
+    stiffness, added = (40.0, np.zeros(wanted.size)) if added is None else (0.0, added)
     (a, b, spring), law, per_effort = sample_joint(), controller.law, controller.command.per_effort
     x, z, waiting, before, speed, rows = np.zeros(4), np.zeros(law.c.size), 0.0, 0.0, 0.0, []
-    for x_0 in wanted:
+    for x_0, push in zip(wanted, added, strict=True):
         torque, place = spring @ x, x[2]
         speed, before = (5e-3 * speed + place - before) / (5e-3 + TS), place
-        asked = 40.0 * (x_0 - place) - 2.0 * speed
+        asked = push + stiffness * (x_0 - place) - 2.0 * speed
         rows.append((torque, asked, place))
         effort, z = law.c @ z + law.d @ [asked, torque], law.a @ z + law.b @ [asked, torque]
         x, waiting = a @ x + b * waiting, effort * per_effort
     return np.array(rows).T
 
 
-def close_by_hand(controller):
+def close_by_hand(controller, stiffness=40.0):
     """Return the matrix of joint, waiting command, law and filter of the speed."""
     (a, b, spring), law, n = sample_joint(), controller.law, controller.law.c.size
     pole, rate = 5.0 / 6.0, 1.0 / 6e-3
-    asked = np.concatenate([-(40.0 + 2.0 * rate) * np.eye(4)[2], [0.0], np.zeros(n), [-2.0]])
+    asked = np.concatenate([-(stiffness + 2.0 * rate) * np.eye(4)[2], [0.0], np.zeros(n), [-2.0]])
     read = np.concatenate([spring, np.zeros(n + 2)])
     effort = np.concatenate([np.zeros(5), law.c, [0.0]]) + law.d[0] * asked + law.d[1] * read
     rows = np.zeros((n + 6, n + 6))
@@ -81,6 +90,18 @@ def test_a_step_moves_the_link_as_the_equations_say(knee):
     for found, expected in ((played.outputs["tau_s"], torque), (played.reference, asked)):
         np.testing.assert_allclose(found[0], expected, atol=1e-5 * np.ptp(expected))
     np.testing.assert_allclose(played.outputs["theta_l"][0], place, atol=1e-6)
+
+
+def test_damping_alone_is_added_to_the_torque_that_is_asked_for(damped, force):
+    played = play(Stage(controller=damped, plant=FREE), STEP, [VALUES])
+    push = np.repeat([0.0, 4.0], [200, 1000])
+    torque, asked, place = simulate(damped, np.zeros(1200), push)
+    assert np.min(asked[220:]) < 0.6 * 4.0  # it is damped
+    for found, expected in ((played.outputs["tau_s"], torque), (played.reference, asked)):
+        np.testing.assert_allclose(found[0], expected, atol=1e-5 * np.ptp(expected))
+    np.testing.assert_allclose(played.outputs["theta_l"][0], place, atol=1e-6)
+    held, plain = (play(Stage(controller=each, plant=HELD), STEP, [VALUES]) for each in (damped, force))
+    np.testing.assert_allclose(held.outputs["tau_s"], plain.outputs["tau_s"], atol=1e-9)
 
 
 def test_a_link_that_is_held_or_gripped_has_the_force_asked_for(knee, force):
@@ -107,14 +128,19 @@ def test_a_pendulum_rests_at_an_angle_where_its_stiffness_carries_it(force):
     assert played.outputs["theta_l"][0, -1] > 0.45
 
 
-def test_the_linear_loop_of_the_judgement_has_the_outer_loop(knee):
-    view = linearise_last_phase(Stage(controller=knee, plant=FREE), STEP, VALUES)
-    found = np.sort(np.abs(view.loop.eigenvalues()))[::-1]
-    np.testing.assert_allclose(found[:6], np.sort(np.abs(np.linalg.eigvals(close_by_hand(knee))))[::-1][:6], rtol=1e-7)
+@pytest.mark.parametrize("stiffness", [40.0, 0.0])
+def test_the_linear_loop_of_the_judgement_has_the_outer_loop(knee, damped, stiffness):
+    law = knee if stiffness else damped
+    view = linearise_last_phase(Stage(controller=law, plant=FREE), STEP, VALUES)
+    found, expected = view.loop.eigenvalues(), np.linalg.eigvals(close_by_hand(law, stiffness))
+    np.testing.assert_allclose(*(np.sort(np.abs(each))[::-1][:6] for each in (found, expected)), rtol=1e-7)
 
 
-def test_an_outer_loop_that_makes_the_link_swing_fails_its_scenarios(force, knee):
-    pushing = add_impedance(force, FREE, VALUES, replace(ASKED, damping=-1.0), name="free")
+@pytest.mark.parametrize("stiffness", [40.0, 0.0])
+def test_an_outer_loop_that_makes_the_link_swing_fails_its_scenarios(force, knee, damped, stiffness):
+    knee = knee if stiffness else damped
+    asked = replace(ASKED, stiffness=stiffness, damping=-1.0)
+    pushing = add_impedance(force, FREE, VALUES, asked, name="free")
     runs = {name: verify(each, {"free": FREE}, VALUES) for name, each in (("kept", knee), ("pushed", pushing))}
     assert runs["kept"].met
     assert {"unstable", "growth"} <= {kind for row in runs["pushed"].rows for kind in row.kinds}
@@ -138,13 +164,17 @@ def test_a_lever_that_is_pulled_on_is_not_let_fall():
     assert names[0] - names[1] == {"fall through 90 deg"}
 
 
-def test_a_schedule_is_pushed_with_its_outer_loop(force):
-    schedule = tune_schedule(HELD, VALUES, force.spec, "k_s", [280.0, 320.0])
-    laws = tuple(add_impedance(each, FREE, VALUES, ASKED, name="free") for each in schedule.controllers)
+@pytest.mark.parametrize("stiffness", [40.0, 0.0])
+def test_a_schedule_is_pushed_with_its_outer_loop(force, stiffness):
+    schedule, asked = (
+        tune_schedule(HELD, VALUES, force.spec, "k_s", [280.0, 320.0]),
+        replace(ASKED, stiffness=stiffness),
+    )
+    laws = tuple(add_impedance(each, FREE, VALUES, asked, name="free") for each in schedule.controllers)
     schedule = replace(schedule, controllers=laws)
     start = RestStart.at_rest(schedule, FREE, VALUES, 300.0)
     pulses = np.repeat([0.0, 1.0], [50, 450])
     run = start.run(FREE, start.params, 4.0 * pulses[None], np.full(500, 300.0))
-    torque, asked, place = simulate(schedule.at(300.0), 0.1 * pulses)
+    torque, asked, place = simulate(schedule.at(300.0), 0.1 * pulses, None if stiffness else 4.0 * pulses)
     np.testing.assert_allclose(run.outputs["theta_l"][0], place, atol=1e-6)
     np.testing.assert_allclose(start.find_errors(run, np.full(500, 300.0))[0], torque - asked, atol=1e-4)

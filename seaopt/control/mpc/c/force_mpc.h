@@ -52,7 +52,8 @@ force_mpc_real force_mpc_step(force_mpc *s, force_mpc_real reference, force_mpc_
 
 #if FORCE_MPC_OUTER
 /* Once a sample, before force_mpc_step: the reference that renders the impedance, of where the link is to be and where it
- * is, in m or rad, read in the same sample as the measurement. Where either is no number the last one stands. */
+ * is, in m or rad, read in the same sample as the measurement. Where either is no number the last one stands. Without
+ * stiffness the first does nothing: a force that is asked for besides is added to what this returns. */
 force_mpc_real force_mpc_outer(force_mpc *s, force_mpc_real reference, force_mpc_real position);
 #endif
 
