@@ -26,6 +26,7 @@ DEPENDS = 0.7  # correlation from which half of a value's variance is that of an
 UNSEEN = 0.02  # of an output's spread: what may be zero is known well enough where half its interval does less
 BLOCKS, EVENT = 64, 0.1  # of a log: in so many blocks an input moves or rests; and the longest event, as a share
 MOVES = 0.01  # of the block in which an input moves the most
+LOUD = 6.0  # standard deviations of a reading's noise in a block, above which it moves
 READING = 0.05  # of a constant, up to which what is white about it is a reading's noise
 
 
@@ -155,15 +156,25 @@ def _measure_event(experiment: Experiment) -> list[float] | None:
         if noise <= READING * abs(middle) and np.var(steps) >= noise**2:  # a reading that is white about a constant
             sizes.append(abs(middle))
             continue
-        if _measure_activity(steps) > EVENT:
+        if _measure_activity(values) > EVENT:
             return None
         sizes.append(float(np.ptp(values)))
     return sizes
 
 
-def _measure_activity(steps: Signal) -> float:
+def _measure_activity(values: Signal) -> float:
     """Return which part of a log an input moves in, from its first move to its last; 0 where it never moves."""
-    power = np.array([float(np.sum(block**2)) for block in np.array_split(steps, BLOCKS)])
-    power -= float(np.median(power))  # of a reading's noise
-    moving = np.flatnonzero(power > MOVES * np.max(power))
-    return (int(moving[-1]) - int(moving[0]) + 1) / BLOCKS if np.max(power) > 0.0 else 0.0
+    blocks = np.array_split(values, BLOCKS)
+    power = np.array([float(np.sum(block**2)) for block in np.array_split(np.diff(values), BLOCKS)])
+    rest, largest = float(np.median(power)), float(np.ptp(values))
+    power -= rest  # of a reading's noise
+    moves = power > MOVES * np.max(power)
+    square = rest / blocks[0].size  # of what changes from sample to sample: twice the variance of what is white
+    white = float(np.median([np.var(block) for block in blocks])) <= square
+    if 0.0 < 0.5 * square <= (READING * largest) ** 2 and white:
+        means = np.diff([float(np.mean(block)) for block in blocks], prepend=float(np.mean(blocks[0])))
+        spread = 1.4826 * float(np.median(np.abs(power - np.median(power))))
+        moves &= power > LOUD * spread
+        moves |= np.abs(means) > max(LOUD * np.sqrt(square / blocks[0].size), MOVES**0.5 * np.max(np.abs(means)))
+    moving = np.flatnonzero(moves)
+    return (int(moving[-1]) - int(moving[0]) + 1) / BLOCKS if moving.size and largest > 0.0 else 0.0

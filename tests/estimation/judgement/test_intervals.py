@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.estimation import Fit, compare_with_log
-from seaopt.estimation.judgement.intervals import find_step_error
+from seaopt.estimation.judgement.intervals import find_single_event, find_step_error
 from seaopt.files import to_json
 
 N, PERIOD = 8000, 1e-3
@@ -169,6 +169,23 @@ def test_one_step_has_no_power_to_refute():
     assert so.fit([step_at(1.0)], params, validation=[step_at(1.0, size=0.25)]).met
     silent = [step_at(1.0, size=1e-6)]  # a log for validation in which nothing is seen
     assert "event" in list_kinds(so.fit([step_at(1.0)], params, validation=silent), "error")
+
+
+@pytest.mark.parametrize("rise", [1, 50])
+@pytest.mark.parametrize("noise", [0.01, 0.05])
+def test_one_step_stays_one_in_a_reading_with_noise(rise, noise):
+    """A current that takes 0.1 s to rise, and whose reading has 5 % noise: no sample stands out."""
+    time, stand = np.arange(5000) / 500, so.plants.high_impedance()
+    reading = noise * np.random.default_rng(1).normal(size=time.size)
+
+    def log(current):
+        log = so.Log.from_arrays(time=time, I=current + reading, F1=np.zeros(time.size))
+        return so.Experiment(plant=stand, log=log, outputs=("F1",))
+
+    step = np.interp(time, [2.0, 2.0 + rise / 500], [0.0, 1.0])
+    assert [finding.kind for finding in find_single_event([log(step)])] == ["event"]
+    assert not list(find_single_event([log(step - 0.3 * (time > 7.0))]))  # a second one
+    assert not list(find_single_event([log(0.0 * step + reading)]))  # noise that is the input
 
 
 def test_steps_of_one_size_are_no_evidence_however_many_logs_have_one():
