@@ -6,10 +6,16 @@ from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from seaopt.errors import LogError
 from seaopt.records import record
+
+# Arrays of numbers, and of row numbers, by their shape: of one call all with the same letter are as long as each other.
+VectorN = Float[np.ndarray, " n"]
+VectorM = Float[np.ndarray, " m"]
+VectorK = Float[np.ndarray, " k"]
+RowsK = Int[np.ndarray, " k"]
 
 # What channels are called where nobody says what they are, in any case.
 INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u", "v", "duty", "goal"})
@@ -36,7 +42,7 @@ class Signal:
     """One channel of a log: samples in an SI unit."""
 
     name: str  # the channel's name, usually that of a plant's input or output
-    values: Float[np.ndarray, " n"]  # samples in `unit`; NaN marks a missing one
+    values: VectorN  # samples in `unit`; NaN marks a missing one
     unit: str = ""  # SI unit text; "" where it was not said (arrays from Python are SI by convention)
     origin: Origin = Origin()  # file, column and conversion
 
@@ -51,7 +57,7 @@ class Recording(Protocol):
     """A log or a table, as far as both are read alike: channels of one clock, source and notes."""
 
     @property
-    def time(self) -> Float[np.ndarray, " n"]:
+    def time(self) -> VectorN:
         """Seconds."""
         ...
 
@@ -91,7 +97,7 @@ class Table:
         Hash of the law that it says it was taken under; empty where it does not.
     """
 
-    time: Float[np.ndarray, " n"]
+    time: VectorN
     signals: Mapping[str, Signal]
     source: str
     notes: tuple[str, ...] = ()

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import SimulationError, require_memory
 from seaopt.options import option
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 
 @record
@@ -20,7 +20,7 @@ class Chirp:
     f0_hz: float = option("At the start.", unit="Hz")
     f1_hz: float = option("At the end.", unit="Hz")
 
-    def samples(self, time: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+    def samples(self, time: VectorN, rng: np.random.Generator) -> VectorN:
         """Return the excitation at `time`, which starts at 0."""
         if not 0.0 < self.f0_hz < self.f1_hz:
             raise SimulationError(f"chirp: f0_hz = {self.f0_hz:g}, f1_hz = {self.f1_hz:g}; 0 < f0_hz < f1_hz is needed")
@@ -37,7 +37,7 @@ class Noise:
     std: float = option("Standard deviation, in the input's unit.")
     band_hz: float = option("Highest frequency.", unit="Hz")
 
-    def samples(self, time: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+    def samples(self, time: VectorN, rng: np.random.Generator) -> VectorN:
         """Return the excitation at `time`, drawn from `rng`."""
         if self.band_hz <= 0.0 or self.std < 0.0:
             raise SimulationError(f"noise: std = {self.std:g}, band_hz = {self.band_hz:g}; both must be positive")
@@ -76,7 +76,7 @@ class Multisine:
                 f"{len(self.phases_rad)} phases; give as many of each, phases_rad may be left out"
             )
 
-    def samples(self, time: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+    def samples(self, time: VectorN, rng: np.random.Generator) -> VectorN:
         """Return the excitation at `time`."""
         nyquist = 0.5 / (time[1] - time[0])
         for frequency in self.frequencies_hz:
@@ -121,7 +121,7 @@ def scale(parts: Excitation, factor: float) -> Excitation:
 
 def excite(
     parts: Excitation, *, duration_s: float, rate_hz: float, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[VectorN, VectorN]:
     """Return time and the sum of the parts.
 
     Examples

@@ -7,7 +7,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import fields
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.bench.excitation import Excitation, excite
 from seaopt.errors import SeaoptError, SimulationError, require_memory, require_seed, suggestion
@@ -17,7 +16,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.sensors.deflection import evaluate_weights
 from seaopt.records import record
-from seaopt.signals import Signal
+from seaopt.signals import Signal, VectorN
 from seaopt.simulation import simulate
 
 
@@ -66,7 +65,7 @@ class Sensors:
             }
         )
 
-    def read(self, name: str, values: Float[np.ndarray, " n"], rng: np.random.Generator) -> Float[np.ndarray, " n"]:
+    def read(self, name: str, values: VectorN, rng: np.random.Generator) -> VectorN:
         """Return what the sensor of one output records."""
         out = values + self.offset.get(name, 0.0) + self.noise_std.get(name, 0.0) * rng.normal(size=values.size)
         limit, step = self.saturation.get(name), self.quantisation.get(name)

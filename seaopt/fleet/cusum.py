@@ -35,6 +35,7 @@ from scipy.stats import norm, t
 
 from seaopt.errors import SeaoptError
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 ALLOWANCE = 0.5  # k: best for a change of one standard deviation
 CLIP = 4.0
@@ -60,7 +61,7 @@ def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
     return float(np.linalg.solve(np.eye(STATES) - chain, np.ones(STATES))[0])
 
 
-def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANCE) -> Float[np.ndarray, " n"]:
+def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANCE) -> VectorN:
     """Return the probabilities that a one-sided chart raises an alarm within 0, 1, ... runs, where nothing has changed.
     `threshold`: h, in standard deviations. `runs`: how many, at most. `allowance`: k, in standard deviations.
     """
@@ -172,7 +173,7 @@ def _start(
     correlation: float,
     scale: float,
     dof: float,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[VectorN, VectorN, VectorN]:
     """Return the mean of the first runs, its variance, and its covariance with u of the last of them. They tell mean
     and u together, and nothing of u alone. Of several runs it is the most likely mean of Student's t.
     """
@@ -193,14 +194,14 @@ def _start(
     return mean, spread / count**2, -np.where(present, alike[-1], 0.0).sum(axis=1) / count
 
 
-def _normalise(ratio: Float[np.ndarray, " n"], dof: float) -> Float[np.ndarray, " n"]:
+def _normalise(ratio: VectorN, dof: float) -> VectorN:
     """Return what is distributed as Student's t as what is standard normal."""
     if dof > LEARNT_DOF:
         return ratio
     return np.sign(ratio) * norm.isf(np.maximum(t.sf(np.abs(ratio), dof), 1e-300))
 
 
-def find_change(values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"]) -> int:
+def find_change(values: VectorN, weights: VectorN) -> int:
     """Return from which run on a mean is another one: the step that is most likely, if there is one (Hinkley 1970).
     `weights`: one over the variances of the values, of at least two runs.
     """

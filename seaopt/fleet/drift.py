@@ -37,6 +37,7 @@ from seaopt.fleet.scatter import (
 from seaopt.fleet.worker import FAILED, MET
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.records import Worded, record
+from seaopt.signals import VectorN
 
 FALSE_ALARMS, PER_RUNS = 0.01, 100  # per actuator, within so many runs
 LOW_CHANCE = 0.25  # of an alarm at the threshold by which it is seen whether healthy actuators scatter as assumed
@@ -312,7 +313,7 @@ def find_drift(
 def _shape(batches: Sequence[_Runs], between: Between, threshold: float) -> Between:
     """Return the same with tails, of the innovations until what led to an alarm; of some actuators of many."""
     step = -(-sum(batch.values.size for batch in batches) // (2 * MOST_OF_TAILS))
-    ratios: list[Float[np.ndarray, " n"]] = []
+    ratios: list[VectorN] = []
     for batch in batches:
         values, variances = batch.values[::step], batch.variances[::step]
         charts = chart_runs(values, variances, threshold, **between.chart)
@@ -484,9 +485,7 @@ def _list_alarms(
     return alarms
 
 
-def _measure_change(
-    values: Float[np.ndarray, " n"], weights: Float[np.ndarray, " n"], raised: int, *, rises: bool
-) -> tuple[int, int, float, float]:
+def _measure_change(values: VectorN, weights: VectorN, raised: int, *, rises: bool) -> tuple[int, int, float, float]:
     """Return the runs of a change, first and one past the last, and the means before it and of these. They go on to the
     last run, unless the value has come back since, further than it was: then to the alarm.
     """

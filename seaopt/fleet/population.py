@@ -43,6 +43,7 @@ from seaopt.fleet.result import Fleet
 from seaopt.fleet.worker import FAILED, MET
 from seaopt.formatting import format_count, format_number
 from seaopt.records import Worded, record
+from seaopt.signals import VectorK
 
 CONFIDENT = 1.959964  # standard deviations of a 95 % interval
 RELATIVE = 0.25  # std over value, up to which a positive parameter is taken by its logarithm
@@ -331,9 +332,7 @@ def _propagate_sampling(
     return slopes @ sampling @ slopes.mT
 
 
-def _restore(
-    values: Float[np.ndarray, " k"], stds: Float[np.ndarray, " k"], logarithmic: bool
-) -> tuple[Float[np.ndarray, " k"], ...]:
+def _restore(values: VectorK, stds: VectorK, logarithmic: bool) -> tuple[VectorK, ...]:
     """Return values, stds and ends of intervals of a parameter; the std of a logarithm is relative."""
     low, high = values - CONFIDENT * stds, values + CONFIDENT * stds
     return (

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from jaxtyping import Float
 
 from seaopt.codec import Key, to_content
 from seaopt.estimation.result.findings import GUESS
@@ -17,6 +16,7 @@ from seaopt.fleet.worker import FAILED, GAP, MET, NOT_MET
 from seaopt.formatting import format_count
 from seaopt.problem.problem import name_after
 from seaopt.records import Result, Worded, record
+from seaopt.signals import VectorN
 
 FLEET_SCHEMA = "seaopt/fleet/1"
 SHORT = "short"  # kind of finding of a log that is much shorter than its siblings
@@ -183,7 +183,7 @@ def _spread(name: str, unit: str, met: pl.DataFrame) -> Spread | None:
     return Spread(name=name, unit=unit, logs=values.size, median=median, low=low, high=high, std=float(np.median(stds)))
 
 
-def select_known(rows: pl.DataFrame, name: str) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def select_known(rows: pl.DataFrame, name: str) -> tuple[VectorN, VectorN]:
     """Return the values of a parameter and their standard deviations, of the rows that identify it."""
     values, stds = (rows[column].cast(pl.Float64).to_numpy() for column in (name, f"{name}_std"))
     identified = np.isfinite(values) & np.isfinite(stds)

@@ -31,6 +31,7 @@ from scipy.stats import chi2, norm, t
 from seaopt.codec import OrInfinite
 from seaopt.formatting import format_number
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 CLIP_SQUARE = 6.0  # standardised squared differences count for no more; 1.4 % of those of healthy actuators are larger
 CLIPPED = chi2.cdf(CLIP_SQUARE, 3) + CLIP_SQUARE * chi2.sf(CLIP_SQUARE, 1)  # mean of a clipped square, if normal
@@ -133,16 +134,14 @@ def estimate_between_runs(runs: Sequence[tuple[Runs, Runs]]) -> Between | None:
     return Between(std=variance**0.5, pairs=pairs, dof=dof, correlation=correlation, shaped=True)
 
 
-def _list_differences(
-    runs: Sequence[tuple[Runs, Runs]], lag: int
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _list_differences(runs: Sequence[tuple[Runs, Runs]], lag: int) -> tuple[VectorN, VectorN]:
     """Return the squares of the differences of runs so far apart, and the variances of their fits."""
     squares = [_select((values[:, lag:] - values[:, :-lag]) ** 2) for values, _ in runs]
     fits = [_select(variances[:, lag:] + variances[:, :-lag]) for _, variances in runs]
     return np.concatenate(squares or [np.zeros(0)]), np.concatenate(fits or [np.zeros(0)])
 
 
-def _find_variance(squares: Float[np.ndarray, " n"], fits: Float[np.ndarray, " n"]) -> float:
+def _find_variance(squares: VectorN, fits: VectorN) -> float:
     """Return the variance of one of two runs, beyond that of the fits, which squared differences have."""
 
     def exceed(variance: float) -> float:
@@ -154,7 +153,7 @@ def _find_variance(squares: Float[np.ndarray, " n"], fits: Float[np.ndarray, " n
     return 0.0 if exceed(0.0) <= 0.0 else float(solver(exceed, 0.0, largest, xtol=1e-12 * largest))
 
 
-def _fit_variogram(variogram: Float[np.ndarray, " n"], fit: float, pairs: int) -> tuple[float, float]:
+def _fit_variogram(variogram: VectorN, fit: float, pairs: int) -> tuple[float, float]:
     """Return variance and correlation, by least squares of sigma^2 (1 - phi^k); the latter by an error larger."""
     lags = np.arange(1, variogram.size + 1)
 
@@ -172,7 +171,7 @@ def _fit_variogram(variogram: Float[np.ndarray, " n"], fit: float, pairs: int) -
     return fit_variance(correlation), float(correlation)
 
 
-def _count_freedom(fits: Float[np.ndarray, " n"], variance: float) -> float:
+def _count_freedom(fits: VectorN, variance: float) -> float:
     """Return the degrees of freedom of a run's variance, from the sampling variance of the clipped mean square.
     Differences that share a run are correlated by -1/2, their squares by 1/4: half as much again as if they were not.
     """
@@ -181,7 +180,7 @@ def _count_freedom(fits: Float[np.ndarray, " n"], variance: float) -> float:
     return float(2.0 * (variance + np.median(fits) / 2.0) ** 2 / sampling)
 
 
-def estimate_tails(ratios: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def estimate_tails(ratios: VectorN) -> tuple[float, float]:
     """Return degrees of freedom and scale of Student's t; infinite and 1 where ratios may as well be normal. `ratios`:
     standardised innovations of healthy runs, before they are clipped.
     """
@@ -260,5 +259,5 @@ def _measure_halves(values: Runs, variances: Runs, between: Between) -> Float[np
     return np.stack(halves, axis=1)
 
 
-def _select(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, " n"]:
+def _select(values: Float[np.ndarray, "..."]) -> VectorN:
     return values[np.isfinite(values)]

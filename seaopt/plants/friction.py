@@ -28,6 +28,7 @@ from seaopt.plants.memo import memo
 from seaopt.plants.plant import CompletedParameters, Plant, jacobians, name_parameters, name_symbols, state_space
 from seaopt.plants.roles import Bristles, Friction, change_ports, with_values
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 SLIDING, STUCK = "sliding", "stuck"
 STATES = (SLIDING, STUCK)
@@ -100,7 +101,7 @@ def _list_low_speeds(friction: Friction, params: CompletedParameters) -> list[fl
     return [float(speed) for speed in SAMPLED_SPEEDS if speed <= max(LOW_SPEED, smoothed)]
 
 
-def find_locked_modes(plant: Plant, params: ParameterSet) -> Float[np.ndarray, " n"]:
+def find_locked_modes(plant: Plant, params: ParameterSet) -> VectorN:
     """Return the frequencies (Hz) at which the plant swings at rest while every joint that can stick does so. With A of
     the sliding plant, B the effect of the friction forces and C the rows of their velocities, a force that keeps C x at
     zero leaves A - B (C B)^-1 C A. Where bristles hold it, the plant is the stuck one.

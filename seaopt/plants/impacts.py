@@ -29,15 +29,15 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import PlantError, suggestion
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import CompletedParameters, Plant, agree, evaluate, output_function
 from seaopt.plants.roles import Port
+from seaopt.signals import VectorM, VectorN
 
-State = Float[np.ndarray, " n"]
-HeldState = Float[np.ndarray, " m"]
+State = VectorN
+HeldState = VectorM
 
 
 def strike(plant: Plant, params: CompletedParameters, state: State, output: str, impulse: float) -> State:

@@ -12,6 +12,7 @@ from seaopt.formatting import html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants.plant import Plant, state_space
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 
 @record
@@ -119,11 +120,7 @@ def modes(
 
 
 def _compute_static_gain(
-    a: Float[np.ndarray, "n n"],
-    b: Float[np.ndarray, " n"],
-    c: Float[np.ndarray, " n"],
-    d: float,
-    poles: Complex[np.ndarray, " n"],
+    a: Float[np.ndarray, "n n"], b: VectorN, c: VectorN, d: float, poles: Complex[np.ndarray, " n"]
 ) -> float:
     """Return the limit of c (s - a)^-1 b + d at s = 0; a pole there may cancel in one transfer function only."""
     if np.linalg.cond(a) < 1e14:
@@ -137,9 +134,7 @@ def _compute_static_gain(
     return 0.0 if abs(nearer) < 0.3 * abs(near) or largest == 0.0 else nearer
 
 
-def _find_zeros(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, " n"], d: float
-) -> Complex[np.ndarray, " m"]:
+def _find_zeros(a: Float[np.ndarray, "n n"], b: VectorN, c: VectorN, d: float) -> Complex[np.ndarray, " m"]:
     """Return the finite generalised eigenvalues of the system pencil [[A, b], [c, d]] - z diag(1, 0). The pencil is
     scaled first: forces in newtons and strains in metres stand ten decades apart.
     """

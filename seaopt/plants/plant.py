@@ -45,6 +45,7 @@ from seaopt.plants.roles import (
     Winding,
 )
 from seaopt.records import record
+from seaopt.signals import VectorN
 from seaopt.units import factor, unit_after
 
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
@@ -463,7 +464,7 @@ def state_space(
     return a, b, c, d
 
 
-def fill_vector(kind: str, names: Mapping[str, str], values: Mapping[str, float] | None) -> Float[np.ndarray, " n"]:
+def fill_vector(kind: str, names: Mapping[str, str], values: Mapping[str, float] | None) -> VectorN:
     """Return the vector of `names` with the given values, zero elsewhere. Raises PlantError: an unknown name."""
     if values is not None and not isinstance(values, Mapping):
         raise PlantError(f"{kind}s are given as a {type(values).__name__}; give a mapping of {kind} name to value")

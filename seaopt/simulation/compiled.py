@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
+from seaopt.signals import VectorM
 from seaopt.simulation.discretisation import Clock, transition
 from seaopt.simulation.integrator import output_function, rate_functions, step_function
 from seaopt.simulation.model import Model
@@ -208,7 +209,7 @@ def _discretise(model: Model, theta: bytes, clock: Clock) -> Float[np.ndarray, "
     return transition(model, np.frombuffer(theta), clock)
 
 
-def _linear_data(model: Model, point: Point, layout: Layout) -> Float[np.ndarray, " m"]:
+def _linear_data(model: Model, point: Point, layout: Layout) -> VectorM:
     """Return D and A of pass.c: rows of [x+; y], forced with derivatives last, and by the state."""
     blocks = _discretise(model, point.theta.tobytes(), point.clock)
     nx, nu, rows, delayed = model.nx, model.nu, model.nx + model.ny, _count_delayed(model, point)
@@ -230,7 +231,7 @@ def _count_memory(a: Float[np.ndarray, "nx nx"], limit: int) -> int:
     return 0
 
 
-def _settings(model: Model, point: Point) -> Float[np.ndarray, " m"]:
+def _settings(model: Model, point: Point) -> VectorM:
     clock = point.clock
     foh = float(clock.hold == "first")
     constants = model.parameters(point.theta)
@@ -300,7 +301,7 @@ class Program:
         output_rows: int | None = None,
         columns: bool = False,
         states: bool = False,
-        resume: Float[np.ndarray, " m"] | None = None,
+        resume: VectorM | None = None,
         room: Pass | None = None,
     ) -> Pass:
         """Run the samples from `first` to before `last`; with `resume`, go on where the samples before them stopped.
@@ -363,6 +364,6 @@ class Program:
         starts = np.vstack([x0, np.zeros_like(x0)])
         return np.array([first, (first + last) // 2, last]), starts, np.array([0, self.run_up])
 
-    def carry(self) -> Float[np.ndarray, " m"]:
+    def carry(self) -> VectorM:
         """Return room for what a shot hands from one call to the next."""
         return np.zeros(int(self.kernel.library.carry_size()))

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from seaopt.plants.memo import memo
 from seaopt.records import record
+from seaopt.signals import VectorM, VectorN
 from seaopt.simulation.discretisation import Hold, transition
 from seaopt.simulation.integrator import output_function, step_function
 from seaopt.simulation.model import Model
@@ -49,9 +50,7 @@ def interpret_pass(
     return Pass(gram=gram, loss=loss, count=count, outputs=y, columns=v, states=x)
 
 
-def _loss_and_weight(
-    r: Float[np.ndarray, " n"], loss: str, knee: float
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def _loss_and_weight(r: VectorN, loss: str, knee: float) -> tuple[VectorN, VectorN]:
     """Return the loss of each residual and the weight that makes its square's gradient the loss's."""
     size = np.abs(r)
     if loss == "soft_l1":
@@ -246,10 +245,7 @@ def _output_map(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int,
 
 
 def _fold(
-    chain: Callable[[int], Any],
-    z: Float[np.ndarray, "nx nj"],
-    w: Float[np.ndarray, "n w"],
-    data: Float[np.ndarray, " m"],
+    chain: Callable[[int], Any], z: Float[np.ndarray, "nx nj"], w: Float[np.ndarray, "n w"], data: VectorM
 ) -> Float[np.ndarray, "n1 nx nj"]:
     """Fold over all samples at most FOLDED_SAMPLES at a time; the last ones are filled up to a power of two, so that
     few functions do for all lengths, with repeats, which are dropped.

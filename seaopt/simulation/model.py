@@ -17,6 +17,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick
 from seaopt.plants.memo import memo
 from seaopt.records import record
+from seaopt.signals import VectorM
 from seaopt.simulation.sticking import has_one_joint, separate_jumps
 
 
@@ -111,7 +112,7 @@ class Model:
     def __deepcopy__(self, memory: dict[int, Any]) -> Model:
         return self
 
-    def parameters(self, theta: Float[np.ndarray, " np"]) -> Float[np.ndarray, " m"]:
+    def parameters(self, theta: Float[np.ndarray, " np"]) -> VectorM:
         """Return the values of `p`."""
         return np.concatenate([theta, self.constants])
 

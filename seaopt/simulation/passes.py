@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 
 from seaopt.errors import SimulationError
 from seaopt.records import record
+from seaopt.signals import VectorM, VectorN
 from seaopt.simulation.discretisation import Clock
 
 MAX_SECTIONS = 8  # as in layout.h
@@ -72,8 +73,8 @@ class Segment:
         Drift's coordinate, which runs from -1 to 1 over the whole log, at the first sample, and its step.
     """
 
-    u: tuple[Float[np.ndarray, " m"], ...]
-    y: tuple[Float[np.ndarray, " n"], ...] = ()
+    u: tuple[VectorM, ...]
+    y: tuple[VectorN, ...] = ()
     keep: tuple[UInt8[np.ndarray, " n"], ...] = ()
     lead: int = 0
     start_s: float = 0.0
@@ -85,7 +86,7 @@ class Segment:
         return self.u[0].size - self.lead
 
     @property
-    def inputs(self) -> tuple[Float[np.ndarray, " n"], ...]:
+    def inputs(self) -> tuple[VectorN, ...]:
         """Input samples at the samples of the outputs."""
         return tuple(channel[self.lead :] for channel in self.u)
 

@@ -13,7 +13,7 @@ from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import fill_vector
-from seaopt.signals import Signal
+from seaopt.signals import Signal, VectorN
 from seaopt.simulation.discretisation import Clock, Hold
 from seaopt.simulation.model import Model, make_model
 from seaopt.simulation.passes import Pass, Point, Segment
@@ -23,12 +23,12 @@ MAX_SIMULATION_SUBSTEPS = 1024
 ROUNDING = 1e-6  # of an output: below it an error is not held against the output itself
 
 
-def input_samples(plant: Plant, log: Log) -> tuple[Float[np.ndarray, " n"], ...]:
+def input_samples(plant: Plant, log: Log) -> tuple[VectorN, ...]:
     """Return the plant's inputs from a log's channels of the same names, in the plant's order; of an optional input
     that it has none of zeros, or the time since it began. Raises LogError: an input is missing from the log, or has
     missing samples.
     """
-    columns: list[Float[np.ndarray, " n"]] = []
+    columns: list[VectorN] = []
     driven = any(name in log.signals for name in plant.inputs)  # by one at least, though all may be optional
     for name in plant.inputs:
         if name not in log.signals:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.formats.source import MAX_DEPTH, MAX_PARTS, Field, Source, Window, summarise_error
 from seaopt.logs.formats.text_layout import MAX_LINE, line_length_error
+from seaopt.signals import VectorN
 from seaopt.units import header_unit
 
 LARGEST = 1e308  # number that is taken; JSON has whole ones of any length
@@ -55,7 +55,7 @@ def open_json(path: Path) -> Source:
     )
 
 
-def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
+def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, VectorN]:
     columns: dict[str, list[float]] = {name: [] for name in names}
     with closing(_read_entries(path)[1]) as entries:
         for place, entry in entries:

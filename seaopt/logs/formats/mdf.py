@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.formats.source import Field, Source, Window, check_size, import_optional, make_row_loader
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 NUMERIC_CONVERSIONS = frozenset({0, 1, 2, 4, 5, 6})  # conversions: none, linear, rational, tables of numbers
 INTEGER_TYPES, FLOAT_TYPES = frozenset({0, 1, 2, 3}), frozenset({4, 5})
@@ -103,12 +103,10 @@ def _name_kind(channel: Any) -> str:
     return "text"
 
 
-def _load(
-    path: Path, places: ChannelPlaces, names: Sequence[str], window: Window | None
-) -> dict[str, Float[np.ndarray, " n"]]:
+def _load(path: Path, places: ChannelPlaces, names: Sequence[str], window: Window | None) -> dict[str, VectorN]:
     with _open_file(path) as file:
 
-        def load_column(name: str, rows: slice) -> Float[np.ndarray, " n"]:
+        def load_column(name: str, rows: slice) -> VectorN:
             group, index = places[name]
             start = rows.start or 0
             count = None if rows.stop is None else rows.stop - start

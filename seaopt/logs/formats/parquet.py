@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.files import check_name
 from seaopt.logs.formats.source import Field, Source, Window
+from seaopt.signals import VectorN
 from seaopt.units import header_unit
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def _make_field(name: str, dtype: pl.DataType, length: int) -> Field:
     return Field(name=name, kind=kind, length=length, unit=header_unit(name))
 
 
-def _load(path: Path, names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " n"]]:
+def _load(path: Path, names: Sequence[str], window: Window | None) -> dict[str, VectorN]:
     import polars as pl
 
     with _silence_panics():

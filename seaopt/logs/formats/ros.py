@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.formats.json import flatten, name_kind
 from seaopt.logs.formats.messages import Node, build_tree, build_wanted_tree, list_leaves, take_values
 from seaopt.logs.formats.source import Field, Source, Window, import_optional, summarise_error
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 MAX_CHUNK = 1 << 30  # bytes
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -122,7 +122,7 @@ def _find_unit(path: str) -> str | None:
 
 def _load(
     path: Path, open_file: BagOpener, nodes: Mapping[str, Node | None], names: Sequence[str], window: Window | None
-) -> dict[str, Float[np.ndarray, " n"]]:
+) -> dict[str, VectorN]:
     with open_file(path) as bag:
         topic = next(
             topic
@@ -143,7 +143,7 @@ def _load(
             f"{path}: {topic.name} counts {topic.count} messages and holds {len(times)}, the file is damaged; "
             "copy or record it again"
         )
-    out: dict[str, Float[np.ndarray, " n"]] = {}
+    out: dict[str, VectorN] = {}
     for name in paths.values():
         if _find_unit(name) == "s":  # of stamps from 1970 on, count from the start of the recording
             stamps = np.array([int(row[name]) for row in rows], dtype=np.int64)

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError, SeaoptError, suggestion
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 # What one file may unfold to in memory: archives are checked before they are unpacked.
 MAX_UNPACKED = 8 << 30
@@ -142,7 +143,7 @@ def open_columns(
     )
 
 
-def find_rows(clock: Float[np.ndarray, " n"], window: Window) -> slice:
+def find_rows(clock: VectorN, window: Window) -> slice:
     """Return the rows from the first to the last sample inside the window."""
     inside = np.flatnonzero((clock >= window.start) & (clock <= window.stop))
     return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.formats.source import Source, Where, summarise_error
@@ -33,6 +32,7 @@ from seaopt.logs.formats.text_layout import (
     line_length_error,
     split_cells,
 )
+from seaopt.signals import VectorN
 
 if TYPE_CHECKING:
     import polars as pl
@@ -58,7 +58,7 @@ def open_text(path: Path) -> Source:
     )
 
 
-def _load_blocks(layout: TextLayout, names: Sequence[str], where: Where) -> dict[str, Float[np.ndarray, " n"]]:
+def _load_blocks(layout: TextLayout, names: Sequence[str], where: Where) -> dict[str, VectorN]:
     """Return columns of the rows in which others have given values; of all rows without any."""
     places = {field.name: (field.position or 1) - 1 for field in layout.fields}
     index, values = {name: places[name] for name in names}, {places[name]: value for name, value in where.items()}
@@ -100,7 +100,7 @@ class _GrowingColumns:
             array[self.rows : stop] = values
         self.rows = stop
 
-    def finish(self) -> dict[str, Float[np.ndarray, " n"]]:
+    def finish(self) -> dict[str, VectorN]:
         for array in self.arrays.values():
             array.resize(self.rows, refcheck=False)
         return self.arrays

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from seaopt.errors import LogError
 from seaopt.logs.quality.clock import measure_steps
 from seaopt.records import record
+from seaopt.signals import RowsK, VectorM, VectorN
 
 TICK = 1e-9  # seconds within which two instants are one: an offset that is taken off leaves rounding behind
 MOST_PACE = 1.25  # readings for an instant: of a faster clock `Readings` would leave out too many
@@ -39,9 +40,7 @@ class Hold:
         """How far from an instant the rule looks for samples."""
         return self.max_age_s
 
-    def __call__(
-        self, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"]
-    ) -> Float[np.ndarray, " n"]:
+    def __call__(self, at: VectorN, time: VectorM, values: VectorM) -> VectorN:
         """Return the values at the instants `at`, NaN where the rule has none."""
         before, _, inside = _neighbours(at, time)
         return np.where(inside & (at - time[before] <= self.max_age_s), values[before], np.nan)
@@ -73,9 +72,7 @@ class Linear:
         """How far from an instant the rule looks for samples."""
         return self.max_gap_s
 
-    def __call__(
-        self, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"]
-    ) -> Float[np.ndarray, " n"]:
+    def __call__(self, at: VectorN, time: VectorM, values: VectorM) -> VectorN:
         """Return the values at the instants `at`, NaN where the rule has none."""
         before, after, inside = _neighbours(at, time)
         step = time[after] - time[before]
@@ -112,9 +109,7 @@ class Nearest:
         """How far from an instant the rule looks for samples."""
         return self.tolerance_s
 
-    def __call__(
-        self, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"]
-    ) -> Float[np.ndarray, " n"]:
+    def __call__(self, at: VectorN, time: VectorM, values: VectorM) -> VectorN:
         """Return the values at the instants `at`, NaN where the rule has none."""
         before, after, inside = _neighbours(at, time)
         best = np.where(time[after] - at < at - time[before], after, before)
@@ -140,9 +135,7 @@ class Readings:
         """How far from an instant the rule looks for samples."""
         return np.inf
 
-    def __call__(
-        self, at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], values: Float[np.ndarray, " m"]
-    ) -> Float[np.ndarray, " n"]:
+    def __call__(self, at: VectorN, time: VectorM, values: VectorM) -> VectorN:
         """Return the values at the instants `at`, NaN where the rule has none."""
         out, read = np.full(at.size, np.nan), np.isfinite(values)
         time, values = time[read], values[read]
@@ -172,7 +165,7 @@ class Readings:
 Rule = Hold | Linear | Nearest | Readings
 
 
-def check_increasing(time: Float[np.ndarray, " m"], clock: str) -> None:
+def check_increasing(time: VectorM, clock: str) -> None:
     """Refuse (LogError) a clock that is empty, has NaN, repeats or runs backwards: no rule can work on it."""
     if time.size == 0:
         raise LogError(f"{clock} holds no sample; choose another channel or window_s")
@@ -186,7 +179,7 @@ def check_increasing(time: Float[np.ndarray, " m"], clock: str) -> None:
         raise LogError(f"{clock} {how} at sample {row + 1} (t = {time[row]:g} s); sort or remove such rows")
 
 
-def measure_pace(at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> float:
+def measure_pace(at: VectorN, time: VectorM) -> float:
     """Return how many samples a clock has for an instant of another, where both run; rather too few than too many."""
     first, last = _split_at_holes(time)
     inside = np.searchsorted(at, time[last] + TICK) - np.searchsorted(at, time[first] - TICK)
@@ -194,25 +187,21 @@ def measure_pace(at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]) -> 
     return float((np.count_nonzero(near) - first.size) / (np.sum(inside) + first.size))
 
 
-def _split_at_holes(time: Float[np.ndarray, " m"]) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+def _split_at_holes(time: VectorM) -> tuple[RowsK, RowsK]:
     """Return the first and the last sample of each part of a clock between its holes."""
     step = np.diff(time)
     holes = np.flatnonzero(step > measure_steps(step)[1]) if step.size else np.empty(0, np.int64)
     return np.append(0, holes + 1), np.append(holes, time.size - 1)
 
 
-def _find_nearest(
-    at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]
-) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+def _find_nearest(at: VectorN, time: VectorM) -> tuple[Int[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
     """Return the instant nearest to each sample, and whether it is within half a step."""
     after = np.clip(np.searchsorted(at, time), 1, at.size - 1)
     row = np.where(time - at[after - 1] < at[after] - time, after - 1, after)
     return row, np.abs(at[row] - time) <= 0.5 * float(np.median(np.diff(at))) + TICK
 
 
-def _interpolate(
-    at: Float[np.ndarray, " n"], time: Float[np.ndarray, "n p"], values: Float[np.ndarray, "n p"]
-) -> Float[np.ndarray, " n"]:
+def _interpolate(at: VectorN, time: Float[np.ndarray, "n p"], values: Float[np.ndarray, "n p"]) -> VectorN:
     """Return the polynomial through the points of each instant."""
     out = np.zeros(at.size)
     for i in range(time.shape[1]):
@@ -222,9 +211,7 @@ def _interpolate(
     return out
 
 
-def _neighbours(
-    at: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"]
-) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]]:
+def _neighbours(at: VectorN, time: VectorM) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]]:
     """Return the samples on either side of each instant, and whether the instant lies in the clock's span."""
     before = np.clip(np.searchsorted(time, at + TICK, side="right") - 1, 0, time.size - 1)
     after = np.minimum(before + 1, time.size - 1)

@@ -12,11 +12,10 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError
 from seaopt.logs.quality.clock import sample_rate_hz
-from seaopt.signals import Recording
+from seaopt.signals import Recording, VectorK, VectorM, VectorN
 
 PASS_BAND = 0.8  # of the new Nyquist frequency
 ATTENUATION_DB = 80.0
@@ -25,7 +24,7 @@ MISSING_WEIGHT = 0.2  # of the filter's weight on missing samples, beyond which 
 
 def decimate(
     log: Recording, period: float, segments: Sequence[slice], factor: int
-) -> tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], str]:
+) -> tuple[VectorM, dict[str, VectorM], str]:
     """Return every `factor`-th sample behind the filter, and a note: see `Log.decimate`. `log`: uniformly sampled,
     every `period` s. `segments`: rows between gaps, filtered each on its own. Raises LogError: none is as long as the
     filter.
@@ -56,7 +55,7 @@ def decimate(
 
 
 @lru_cache(maxsize=16)
-def _taps(factor: int) -> Float[np.ndarray, " m"]:
+def _taps(factor: int) -> VectorM:
     """Return the filter's taps, an odd number of them, with a gain of 1 at 0 Hz."""
     from scipy.signal import kaiserord  # deferred: 1 s
 
@@ -69,7 +68,7 @@ def _taps(factor: int) -> Float[np.ndarray, " m"]:
     return taps
 
 
-def _filter(values: Float[np.ndarray, " n"], taps: Float[np.ndarray, " m"], factor: int) -> Float[np.ndarray, " k"]:
+def _filter(values: VectorN, taps: VectorM, factor: int) -> VectorK:
     """Return the filter's output where it has all its input, every `factor`-th sample."""
     missing = ~np.isfinite(values)
     if not np.any(missing):
@@ -83,7 +82,7 @@ def _filter(values: Float[np.ndarray, " n"], taps: Float[np.ndarray, " m"], fact
     return np.where(lost, np.nan, _correlate(bridged, taps, factor))
 
 
-def _correlate(values: Float[np.ndarray, " n"], taps: Float[np.ndarray, " m"], factor: int) -> Float[np.ndarray, " k"]:
+def _correlate(values: VectorN, taps: VectorM, factor: int) -> VectorK:
     """Return the correlation of values and taps where they overlap entirely, every `factor`-th of it."""
     from scipy.signal import upfirdn
 

@@ -6,11 +6,8 @@ import importlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from jaxtyping import Float
-
 from seaopt.errors import LogError, suggestion
-from seaopt.signals import Recording, check_distinct
+from seaopt.signals import Recording, VectorN, check_distinct
 from seaopt.units import bare_name, header_unit, si_unit
 
 if TYPE_CHECKING:
@@ -18,7 +15,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 
-def add_headers(log: Recording) -> dict[str, Float[np.ndarray, " n"]]:
+def add_headers(log: Recording) -> dict[str, VectorN]:
     """Return time and channels under headers that carry the unit: "time [s]", "F1 [N]"."""
     columns = {"time [s]": log.time}
     for name, signal in log.signals.items():
@@ -44,7 +41,7 @@ def to_pandas(log: Recording) -> pd.DataFrame:
 
 def read_frame(
     frame: Any, time: str, channels: Mapping[str, str] | None, units: Mapping[str, str], source: str
-) -> tuple[dict[str, Float[np.ndarray, " n"]], dict[str, str], tuple[str, ...]]:
+) -> tuple[dict[str, VectorN], dict[str, str], tuple[str, ...]]:
     """Return arrays and units by name, and notes, for `Log.from_frame`. Raises LogError: no frame, or a column that is
     missing, not numeric, or given for two channels of one unit.
     """
@@ -73,7 +70,7 @@ def _all_channels(columns: list[str], time: str) -> dict[str, str]:
     return {name if alone else column: column for name, column, alone in named if column != time}
 
 
-def _column(frame: Any, column: str, source: str) -> Float[np.ndarray, " n"]:
+def _column(frame: Any, column: str, source: str) -> VectorN:
     """Return a column as floats: polars turns nulls into NaN, pandas does so when asked."""
     values = frame[column]
     try:

@@ -25,7 +25,7 @@ from seaopt.logs.quality.clock import (
 )
 from seaopt.logs.quality.report import Quality, assess_quality
 from seaopt.records import PlotAccessor, record
-from seaopt.signals import Signal
+from seaopt.signals import Signal, VectorN
 from seaopt.units import factor, si_unit
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Log:
 
     plot = PlotAccessor()
 
-    time: Float[np.ndarray, " n"]
+    time: VectorN
     signals: Mapping[str, Signal]
     source: str = "arrays"
     notes: tuple[str, ...] = ()
@@ -122,7 +122,7 @@ class Log:
         seconds = _array("time", time, source) * factor(units.get("time", "s"), "s")
         return cls(time=seconds, signals=signals, source=source)
 
-    def __getitem__(self, name: str) -> Float[np.ndarray, " n"]:
+    def __getitem__(self, name: str) -> VectorN:
         """Return the samples of a channel."""
         return self.signal(name).values
 
@@ -187,9 +187,7 @@ class Log:
         note = f"cut to {start_s:g} to {stop_s:g} s: {np.count_nonzero(keep)} of {len(self)} samples"
         return self.with_values(self.time[keep], {name: self[name][keep] for name in self.signals}, note)
 
-    def with_values(
-        self, time: Float[np.ndarray, " n"], values: Mapping[str, Float[np.ndarray, " n"]], note: str
-    ) -> Log:
+    def with_values(self, time: VectorN, values: Mapping[str, VectorN], note: str) -> Log:
         """Return the log's channels, units and origins with other samples, and a note of what was done."""
         signals = {name: replace(self.signals[name], values=array.copy()) for name, array in values.items()}
         return replace(self, time=time.copy(), signals=signals, notes=(*self.notes, note))
@@ -240,13 +238,7 @@ class Log:
         longest = self.gap_s if bridge_s is None else bridge_s
         return self.with_values(
             *resampling.resample(
-                self,
-                self.period,
-                rate_hz=rate_hz,
-                rule=rule,
-                steps=steps,
-                longest_s=longest,
-                hole_s=bridge_s or 0.0,
+                self, self.period, rate_hz=rate_hz, rule=rule, steps=steps, longest_s=longest, hole_s=bridge_s or 0.0
             )
         )
 
@@ -318,7 +310,7 @@ class Log:
             return self
         return self.with_values(*decimation.decimate(self, self.period, self.segments, factor))
 
-    def to_arrays(self) -> dict[str, Float[np.ndarray, " n"]]:
+    def to_arrays(self) -> dict[str, VectorN]:
         """Return copies of time and channels by name, as `from_arrays` takes them."""
         return {"time": self.time.copy()} | {name: self[name].copy() for name in self.signals}
 
@@ -407,26 +399,26 @@ class Log:
         return html_paragraph(self._describe()) + table + html_list(self._remarks()) + self.plot.to_html()
 
 
-def _describe_range(values: Float[np.ndarray, " n"]) -> tuple[str, int]:
+def _describe_range(values: VectorN) -> tuple[str, int]:
     """Return from where to where the samples of a channel go, and how many are missing."""
     finite = values[np.isfinite(values)]
     span = f"{finite.min():.4g} to {finite.max():.4g}" if finite.size else "no finite sample"
     return span, values.size - finite.size
 
 
-def _steps(time: Float[np.ndarray, " n"]) -> Iterator[Float[np.ndarray, " _"]]:
+def _steps(time: VectorN) -> Iterator[Float[np.ndarray, " _"]]:
     """Return the steps of time in blocks that stay in the cache, where they are looked at more than once."""
     for start in range(0, time.size - 1, STEPS_PER_BLOCK):
         yield np.diff(time[start : start + STEPS_PER_BLOCK + 1])
 
 
-def _increases(time: Float[np.ndarray, " n"]) -> bool:
+def _increases(time: VectorN) -> bool:
     """Return whether time is finite and strictly increasing; a time that is not finite has a step that is not."""
     with np.errstate(invalid="ignore", over="ignore"):
         return all(step.min() > 0 and step.max() < np.inf for step in _steps(time))
 
 
-def _describe_fault(time: Float[np.ndarray, " n"]) -> str:
+def _describe_fault(time: VectorN) -> str:
     """Return where time does not increase, and what to do."""
     if not np.all(np.isfinite(time)):
         row = int(np.flatnonzero(~np.isfinite(time))[0])
@@ -441,7 +433,7 @@ def _describe_fault(time: Float[np.ndarray, " n"]) -> str:
     return f"time {how} at sample {row + 1} (t = {time[row]:g} s); {remedy}"
 
 
-def _measure_steps(time: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _measure_steps(time: VectorN) -> tuple[float, float]:
     """Return the sample period and the step above which there is a gap: see `measure_steps`. The median that tells the
     gaps is over at most `STEPS_PER_BLOCK` steps; the odd stride meets both of two steps that alternate.
     """
@@ -457,7 +449,7 @@ def _measure_steps(time: Float[np.ndarray, " n"]) -> tuple[float, float]:
     return total / count, max(GAP * total / count, longest)
 
 
-def _array(name: str, values: Any, source: str) -> Float[np.ndarray, " n"]:
+def _array(name: str, values: Any, source: str) -> VectorN:
     if np.ma.isMaskedArray(values) or np.iscomplexobj(values):
         what = "masked; fill it with NaN" if np.ma.isMaskedArray(values) else "complex; give real numbers"
         raise LogError(f"{source}: channel {name} is {what}")

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from seaopt.errors import LogError, require_number, suggestion
 from seaopt.logs.log.alignment import Hold, Linear, Nearest, Readings, Rule
 from seaopt.logs.quality.clock import GAP, advise_clock, sample_rate_hz, split_at_gaps, timestamp_resolution
-from seaopt.signals import Recording
+from seaopt.signals import Recording, VectorK, VectorM, VectorN
 
 AROUND = 20  # samples on either side of a long step that tell a gap from a late stamp
 PARTS = 20  # of a log, whose medians tell the rate at which the timestamps run
@@ -25,7 +25,7 @@ LEAST_RATE = 0.8  # of the log's rate; below it interpolation would fold what is
 
 HOW_TO_BRIDGE = "bridge_s interpolates across longer ones"
 
-Resampled = tuple[Float[np.ndarray, " m"], dict[str, Float[np.ndarray, " m"]], str]
+Resampled = tuple[VectorM, dict[str, VectorM], str]
 
 
 def resample(
@@ -99,9 +99,7 @@ def resample(
     return np.concatenate(new_time), {name: np.concatenate(parts) for name, parts in new_values.items()}, note
 
 
-def fill_holes(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], longest_s: float, *, held: bool = False
-) -> Float[np.ndarray, " n"]:
+def fill_holes(time: VectorN, values: VectorN, longest_s: float, *, held: bool = False) -> VectorN:
     """Return a channel whose missing samples are on the line between those beside them, or are the one before them of a
     channel that is held, where these are at most so far apart; at an end they are what is next to them. Devices that
     write at times of their own leave such holes.
@@ -117,7 +115,7 @@ def fill_holes(
     return np.where(np.isnan(values) & (apart <= longest_s), line, values)
 
 
-def _uniform_grid(time: Float[np.ndarray, " n"], origin: float, rate_hz: float) -> Float[np.ndarray, " m"]:
+def _uniform_grid(time: VectorN, origin: float, rate_hz: float) -> VectorM:
     """Return the points k/rate_hz after `origin` that lie within `time`, ends included."""
     rounding = 1e-9
     first = np.ceil((time[0] - origin) * rate_hz - rounding)
@@ -125,13 +123,7 @@ def _uniform_grid(time: Float[np.ndarray, " n"], origin: float, rate_hz: float) 
     return np.clip(origin + np.arange(first, last + 1) / rate_hz, time[0], time[-1])
 
 
-def _average_steps(
-    grid: Float[np.ndarray, " m"],
-    time: Float[np.ndarray, " n"],
-    values: Float[np.ndarray, " n"],
-    period: float,
-    rate_hz: float,
-) -> Float[np.ndarray, " m"]:
+def _average_steps(grid: VectorM, time: VectorN, values: VectorN, period: float, rate_hz: float) -> VectorM:
     """Return a signal that keeps each value until the next sample as its mean over each of the grid's periods, so that
     what it drives moves as far. Across a lost sample, where the step is not known, it is a line.
     """
@@ -145,7 +137,7 @@ def _average_steps(
     edges = np.append(grid, grid[-1] + 1.0 / rate_hz)
     widths = np.diff(np.append(starts, max(edges[-1], starts[-1])))
 
-    def integrate(steps: Float[np.ndarray, " k"]) -> Float[np.ndarray, " m"]:
+    def integrate(steps: VectorK) -> VectorM:
         area = np.append(0.0, np.cumsum(widths * steps))
         return np.diff(np.interp(edges, np.append(starts, starts[-1] + widths[-1]), area))
 
@@ -154,9 +146,7 @@ def _average_steps(
     return np.where(integrate(missing.astype(np.float64)) * rate_hz > ROUNDING, np.nan, means)
 
 
-def restamp(
-    log: Recording, period: float, gap_s: float, rate_hz: float | None = None
-) -> tuple[Float[np.ndarray, " n"], str]:
+def restamp(log: Recording, period: float, gap_s: float, rate_hz: float | None = None) -> tuple[VectorN, str]:
     """Return the uniform clock behind rounded or late timestamps, and a note: see `Log.restamp`. Raises LogError:
     rounding alone does not explain them and no rate is stated, or the stated one is not theirs.
     """
@@ -181,7 +171,7 @@ def restamp(
     return uniform, f"timestamps{rounded} put on a uniform clock of {sample_rate_hz(period):.6g} Hz"
 
 
-def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Float[np.ndarray, " n"], str]:
+def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[VectorN, str]:
     """Return a clock of a stated rate, with gaps of whole samples where the timestamps move on for good. A sample that
     was stamped late is followed by a step that is too short: the timestamps come back to their line. At a gap they do
     not: the median of the next `AROUND` samples lies above that of the ones before by whole periods. The stated rate is
@@ -222,7 +212,7 @@ def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Flo
     return line + np.median(time - line), note
 
 
-def _measure_drift(line: Float[np.ndarray, " n"], off: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _measure_drift(line: VectorN, off: VectorN) -> tuple[float, float]:
     """Return by which share timestamps run slower than a line, and how far that leaves them from it, in s. The slope is
     that of the medians of parts of the log, which no spike moves; zero where jitter gives as much. What is left of the
     medians tells whether timestamps and line count alike from end to end.

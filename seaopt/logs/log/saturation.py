@@ -9,11 +9,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from seaopt.formatting import format_count
 from seaopt.logs.log.log import Log
 from seaopt.logs.quality import faults
+from seaopt.signals import VectorN
 
 EXTREME_SAMPLES = 16  # extreme samples among which equal ones give a rail away
 
@@ -49,7 +50,7 @@ def _mask(log: Log, name: str, rows: Bool[np.ndarray, " n"], reason: str, remedy
     return replace(log, signals=signals, notes=(*log.notes, note))
 
 
-def _find_clipped(values: Float[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], str]:
+def _find_clipped(values: VectorN) -> tuple[Bool[np.ndarray, " n"], str]:
     """Return which samples lie at a clear rail, and where the rails are."""
     rows = np.zeros(values.size, dtype=bool)
     if not _may_be_clipped(values):
@@ -64,7 +65,7 @@ def _find_clipped(values: Float[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n
     return rows, "clipped at " + " and ".join(f"{rail.value:.5g}" for rail in rails)
 
 
-def _may_be_clipped(values: Float[np.ndarray, " n"]) -> bool:
+def _may_be_clipped(values: VectorN) -> bool:
     """Return whether some of the largest, or of the least, samples are equal: nearly every log ends here."""
     finite = values[np.isfinite(values)]
     if finite.size <= 2 * EXTREME_SAMPLES:

@@ -12,7 +12,7 @@ from seaopt.logs.quality import faults
 from seaopt.logs.quality.faults import CounterLosses, Rail, RowRanges
 from seaopt.logs.quality.spectra import Hum
 from seaopt.records import record
-from seaopt.signals import Signal
+from seaopt.signals import RowsK, Signal
 
 BEYOND = 1e30  # in SI: more than any sensor gives, and with a square that is still a number
 
@@ -36,7 +36,7 @@ class ChannelQuality:
     held: int = 1  # samples that each value is repeated, regularly; 1 where it is not
     stuck: RowRanges = field(default_factory=RowRanges)  # runs of equal samples that its activity does not explain
     rails: tuple[Rail, ...] = ()  # flat tops and bottoms
-    outliers: Int[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, dtype=int))  # rows
+    outliers: RowsK = field(default_factory=lambda: np.zeros(0, dtype=int))  # rows
     counter: CounterLosses | None = None  # lost samples, where the channel counts
     hum: Hum | None = None
 

@@ -6,10 +6,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from seaopt.errors import LogError
 from seaopt.records import record
+from seaopt.signals import RowsK, VectorM, VectorN
 
 GAP = 1.5  # periods between two samples that make a gap
 LONG = 2.0  # times a step that is usual, where their lengths vary: what is longer is a gap
@@ -65,7 +66,7 @@ def advise_clock(period: float, *, rounded: bool = False) -> tuple[str, list[dic
     return text + "samples of a perfect clock", [{"resample": uniform}, {"resample": {**uniform, "rule": "restamp"}}]
 
 
-def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
+def assess_clock(time: VectorN, source: str) -> ClockQuality:
     """Return rate, jitter, gaps and faults of timestamps. Raises LogError: fewer than two of them increase."""
     finite = np.flatnonzero(np.isfinite(time))
     stamps = time if finite.size == time.size else time[finite]
@@ -94,7 +95,7 @@ def assess_clock(time: Float[np.ndarray, " n"], source: str) -> ClockQuality:
     )
 
 
-def measure_steps(step: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def measure_steps(step: VectorN) -> tuple[float, float]:
     """Return the mean of steps of time that are not across a gap, and the length above which one is. The mean is
     insensitive to rounded stamps, the median only tells the gaps. Longer steps that come often are of the clock itself,
     as where two devices' times alternate, unless they are whole periods: samples were lost there. Whole periods that
@@ -113,17 +114,17 @@ def measure_steps(step: Float[np.ndarray, " n"]) -> tuple[float, float]:
     return period, GAP * max(period, usual)  # where most steps are the long ones, these are no gaps
 
 
-def split_at_gaps(time: Float[np.ndarray, " n"], longest_step: float) -> list[slice]:
+def split_at_gaps(time: VectorN, longest_step: float) -> list[slice]:
     """Return the rows of the segments without a longer step, of two samples or more each."""
     return split_rows(np.flatnonzero(np.diff(time) > longest_step) + 1, time.size, 2)
 
 
-def split_rows(breaks: Int[np.ndarray, " k"], n: int, least: int = 1) -> list[slice]:
+def split_rows(breaks: RowsK, n: int, least: int = 1) -> list[slice]:
     """Return the rows between breaks, of at least so many samples; a break is the first row of what follows."""
     return [slice(first, last) for first, last in pairwise([0, *breaks.tolist(), n]) if last - first >= least]
 
 
-def timestamp_resolution(time: Float[np.ndarray, " n"]) -> float:
+def timestamp_resolution(time: VectorN) -> float:
     """Return the step that timestamps are rounded to; 0 where they are as fine as floats."""
     step = np.diff(time[:ROUNDING_STEPS])
     noise = 16.0 * np.finfo(float).eps * float(np.max(np.abs(time[: step.size + 1])))
@@ -140,11 +141,7 @@ def timestamp_resolution(time: Float[np.ndarray, " n"]) -> float:
 
 
 def _rounding_explains(
-    stamps: Float[np.ndarray, " n"],
-    step: Float[np.ndarray, " m"],
-    across: Float[np.ndarray, " m"] | np.ndarray,
-    rounding: float,
-    period: float,
+    stamps: VectorN, step: VectorM, across: VectorM | np.ndarray, rounding: float, period: float
 ) -> bool:
     """Return whether every segment between gaps lies on a line through its timestamps, within their rounding."""
     if np.any(step < 0.0):

@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import field
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from seaopt.records import record
+from seaopt.signals import RowsK, VectorK, VectorN
 
 LEVEL_SAMPLES = 50_000  # samples that are enough to see a quantisation step
 STILLNESS_BLOCK = 64  # samples over which a channel's stillness is averaged
@@ -31,14 +32,14 @@ FEWEST_SAMPLES = 16  # samples below which nothing is judged
 class RowRanges:
     """Rows from `start` up to, and not including, `stop`, one pair per run."""
 
-    start: Int[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, dtype=int))
-    stop: Int[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0, dtype=int))
+    start: RowsK = field(default_factory=lambda: np.zeros(0, dtype=int))
+    stop: RowsK = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     def __len__(self) -> int:
         return int(self.start.size)
 
     @property
-    def lengths(self) -> Int[np.ndarray, " k"]:
+    def lengths(self) -> RowsK:
         """Samples in each run."""
         return self.stop - self.start
 
@@ -67,8 +68,8 @@ class CounterLosses:
     """A channel that counts: each value held `held` samples, `lost` samples skipped ahead of each of `rows`."""
 
     held: int
-    rows: Int[np.ndarray, " k"]
-    lost: Int[np.ndarray, " k"]
+    rows: RowsK
+    lost: RowsK
 
 
 def find_runs(mask: Bool[np.ndarray, " n"]) -> RowRanges:
@@ -77,13 +78,13 @@ def find_runs(mask: Bool[np.ndarray, " n"]) -> RowRanges:
     return RowRanges(start=edges[::2], stop=edges[1::2])
 
 
-def find_repeats(values: Float[np.ndarray, " n"]) -> RowRanges:
+def find_repeats(values: VectorN) -> RowRanges:
     """Return the runs of two or more equal samples."""
     runs = find_runs(values[1:] == values[:-1])
     return RowRanges(start=runs.start, stop=runs.stop + 1)
 
 
-def measure_stillness(values: Float[np.ndarray, " n"]) -> float:
+def measure_stillness(values: VectorN) -> float:
     """Return the share of samples equal to the last, in the median block of 64: what is usual for the channel."""
     same = values[1:] == values[:-1]
     blocks = same.size // STILLNESS_BLOCK
@@ -92,7 +93,7 @@ def measure_stillness(values: Float[np.ndarray, " n"]) -> float:
     return float(np.median(np.mean(same[: blocks * STILLNESS_BLOCK].reshape(blocks, STILLNESS_BLOCK), axis=1)))
 
 
-def find_quantisation(values: Float[np.ndarray, " n"]) -> float:
+def find_quantisation(values: VectorN) -> float:
     """Return the step whose multiples the samples are; 0 where there is none."""
     stride = max(1, values.size // LEVEL_SAMPLES)
     kinds = np.unique(values[::stride][np.isfinite(values[::stride])])
@@ -113,7 +114,7 @@ def find_quantisation(values: Float[np.ndarray, " n"]) -> float:
     return 0.0
 
 
-def find_outliers(values: Float[np.ndarray, " n"], quantum: float) -> Int[np.ndarray, " k"]:
+def find_outliers(values: VectorN, quantum: float) -> RowsK:
     """Return the rows of samples that stand out from their neighbours (Hampel's test). A sample stands out that lies
     beyond six robust standard deviations from the median of the five samples on each side: both of those ten, and of
     what is usual for such distances over the whole channel. One of the ten may be an outlier too. Pearson et al.,
@@ -139,9 +140,7 @@ def find_outliers(values: Float[np.ndarray, " n"], quantum: float) -> Int[np.nda
     return np.concatenate(standing_out)
 
 
-def _distances(
-    values: Float[np.ndarray, " n"], rows: Int[np.ndarray, " m"]
-) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def _distances(values: VectorN, rows: Int[np.ndarray, " m"]) -> tuple[RowsK, VectorK, VectorK, VectorK]:
     """Return rows whose window is whole, their distance from its median, its spread, and how far they stick out."""
     offsets = np.concatenate([np.arange(-NEIGHBOURS, 0), np.arange(1, NEIGHBOURS + 1)])
     rows = rows[(rows >= NEIGHBOURS) & (rows < values.size - NEIGHBOURS)]
@@ -155,7 +154,7 @@ def _distances(
     return rows[whole], np.abs(at - middle), spread, beyond
 
 
-def find_rails(values: Float[np.ndarray, " n"], quantum: float, still: float) -> list[Rail]:
+def find_rails(values: VectorN, quantum: float, still: float) -> list[Rail]:
     """Return the flat tops and bottoms: equal samples piled up at the largest or the least value."""
     repeated = count_repeats(values) if still >= HOLDS else 1
     stride = max(1, values.size // LEVEL_SAMPLES)
@@ -181,7 +180,7 @@ def find_rails(values: Float[np.ndarray, " n"], quantum: float, still: float) ->
     return flat_edges
 
 
-def find_stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) -> RowRanges:
+def find_stuck(values: VectorN, quantum: float, still: float) -> RowRanges:
     """Return the runs of equal samples that the channel's usual stillness does not explain. With a share p of still
     steps, L equal samples in a row have a probability of about n p^(L-1): the limit is where that is 1e-3. A channel
     that is quantised more coarsely than its noise also rests at its extremes, and leaves them by one quantisation step;
@@ -203,7 +202,7 @@ def find_stuck(values: Float[np.ndarray, " n"], quantum: float, still: float) ->
     return runs.where(long & ~rests & (~ends | (runs.lengths > 2 * longest)))
 
 
-def count_repeats(values: Float[np.ndarray, " n"]) -> int:
+def count_repeats(values: VectorN) -> int:
     """Return how many samples each value is repeated, regularly; 1 where it is not."""
     changes = 1 + np.flatnonzero(values[1:] != values[:-1])
     spacing = np.diff(changes)
@@ -213,7 +212,7 @@ def count_repeats(values: Float[np.ndarray, " n"]) -> int:
     return usual if np.mean(spacing == usual) >= REGULAR else 1
 
 
-def find_counter_losses(values: Float[np.ndarray, " n"]) -> CounterLosses | None:
+def find_counter_losses(values: VectorN) -> CounterLosses | None:
     """Return the samples that a counter shows to be missing; None where the channel does not count. A counter goes up
     by one, at regular intervals, and may wrap.
     """

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.formatting import format_count, format_figure, format_key
 from seaopt.logs.quality.channel import BEYOND, ChannelQuality
@@ -19,7 +18,7 @@ from seaopt.logs.quality.excitation import InputExcitation
 from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.lags import ChannelPair
 from seaopt.records import record
-from seaopt.signals import SAME_SIGN
+from seaopt.signals import SAME_SIGN, VectorN
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -71,9 +70,7 @@ class Finding:
         return asdict(self)
 
 
-def find_clock_faults(
-    clock: ClockQuality, time: Float[np.ndarray, " n"], channels: Iterable[ChannelQuality] = ()
-) -> Iterator[Finding]:
+def find_clock_faults(clock: ClockQuality, time: VectorN, channels: Iterable[ChannelQuality] = ()) -> Iterator[Finding]:
     """Yield what is wrong with the clock. Where devices write rows in turn, by what their channels lack, rounding of
     one clock is no explanation.
     """
@@ -121,9 +118,7 @@ def find_clock_faults(
         )
 
 
-def find_channel_faults(
-    channel: ChannelQuality, time: Float[np.ndarray, " n"], *, may_drive: bool
-) -> Iterator[Finding]:
+def find_channel_faults(channel: ChannelQuality, time: VectorN, *, may_drive: bool) -> Iterator[Finding]:
     """Yield what is wrong with one channel; `may_drive`: it may be an input, as far as is known."""
     name, unit, missing, beyond = channel.name, channel.unit, channel.missing, channel.beyond
     fault = partial(_locate, time=time, channel=name)
@@ -206,7 +201,7 @@ def find_channel_faults(
         )
 
 
-def _advise_on_holes(missing: RowRanges, time: Float[np.ndarray, " n"]) -> dict[str, Any]:
+def _advise_on_holes(missing: RowRanges, time: VectorN) -> dict[str, Any]:
     """Return the keys of a problem file for a log with missing samples: holes that are short and everywhere are
     bridged, else the log is cut.
     """
@@ -228,7 +223,7 @@ def _say_join(keys: Mapping[str, Any]) -> str:
     )
 
 
-def _find_longest_without(runs: RowRanges, time: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _find_longest_without(runs: RowRanges, time: VectorN) -> tuple[float, float]:
     """Return from where to where, in s of the log, the longest part reaches that none of the runs interrupts."""
     starts, stops = np.concatenate([[0], runs.stop]), np.concatenate([runs.start, [time.size]])
     longest = int(np.argmax(stops - starts))
@@ -308,7 +303,7 @@ def count_findings(findings: Sequence[Finding]) -> Mapping[str, int]:
     return {level: sum(finding.severity == level for finding in findings) for level in SEVERITIES}
 
 
-def _locate(runs: RowRanges, time: Float[np.ndarray, " n"], count: int | None = None, **fields: Any) -> Finding:
+def _locate(runs: RowRanges, time: VectorN, count: int | None = None, **fields: Any) -> Finding:
     """Return a finding with its first places, and the number of its samples where no other is counted."""
     pairs = zip(runs.start[:MAX_PLACES], runs.stop[:MAX_PLACES], strict=True)
     where_s = tuple((float(time[start]), float(time[stop - 1])) for start, stop in pairs)

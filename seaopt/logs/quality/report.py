@@ -11,7 +11,6 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.codec import to_content
 from seaopt.errors import LogError, suggestion
@@ -33,7 +32,7 @@ from seaopt.logs.quality.lags import ChannelPair, correlate_channels
 from seaopt.logs.quality.spectra import FEWEST_SEGMENTS, SHORTEST_SEGMENT, Spectra, compute_spectra, find_hum
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import Result, Worded, record
-from seaopt.signals import HOLDING_NAMES, INPUT_NAMES, INPUT_UNITS, SAME_SIGN, Recording
+from seaopt.signals import HOLDING_NAMES, INPUT_NAMES, INPUT_UNITS, SAME_SIGN, Recording, VectorN
 
 QUALITY_SCHEMA = "seaopt/quality/1"
 CHANNELS, PAIRS = 0.6, 0.4  # of the time
@@ -208,7 +207,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
     )
 
 
-def _drop_beyond(values: Float[np.ndarray, " n"], channel: ChannelQuality) -> Float[np.ndarray, " n"]:
+def _drop_beyond(values: VectorN, channel: ChannelQuality) -> VectorN:
     """Return a channel's samples without those that no sensor gives."""
     if not channel.beyond.size:
         return values

@@ -13,6 +13,7 @@ from jaxtyping import Complex, Float
 
 from seaopt import welch
 from seaopt.records import record
+from seaopt.signals import VectorM, VectorN
 
 SHORTEST_SEGMENT, LONGEST_SEGMENT = 32, 1 << 15  # samples in a segment
 FEWEST_SEGMENTS, MOST_SEGMENTS = 4, 64
@@ -28,7 +29,7 @@ BRIDGED_SHARE = 0.02  # share of a segment's samples that may be missing: they a
 class Spectra:
     """Windowed spectra of every channel, one row per segment, from 0 Hz on."""
 
-    frequency_hz: Float[np.ndarray, " m"]
+    frequency_hz: VectorM
     period: float  # seconds between samples
     # channels that have samples missing in most segments are left out, and then segments that have holes
     channels: Mapping[str, Complex[np.ndarray, "d m"]]
@@ -43,7 +44,7 @@ class Spectra:
         """Independent averages that the overlapping segments are worth."""
         return welch.count_averages(self.segments)
 
-    def power(self, name: str) -> Float[np.ndarray, " m"]:
+    def power(self, name: str) -> VectorM:
         """Return the mean power of each line, up to a factor common to all channels."""
         return np.mean(welch.square(self.channels[name]), axis=0)
 
@@ -51,14 +52,12 @@ class Spectra:
         """Return the mean cross-spectrum, first's conjugate times second."""
         return np.mean(np.conj(self.channels[first]) * self.channels[second], axis=0)
 
-    def coherence(self, first: str, second: str) -> Float[np.ndarray, " m"]:
+    def coherence(self, first: str, second: str) -> VectorM:
         """Return the squared coherence of each line."""
         return welch.coherence(self.cross(first, second), self.power(first), self.power(second))
 
 
-def compute_spectra(
-    channels: Mapping[str, Float[np.ndarray, " n"]], segments: Sequence[slice], period: float
-) -> Spectra | None:
+def compute_spectra(channels: Mapping[str, VectorN], segments: Sequence[slice], period: float) -> Spectra | None:
     """Return the channels' spectra over `segments` (rows) sampled every `period` s; None without a segment."""
     total = sum(segment.stop - segment.start for segment in segments)
     length = 2 * (min(max(total // 16, SHORTEST_SEGMENT), LONGEST_SEGMENT) // 2)
@@ -139,7 +138,7 @@ def find_hum(spectra: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
     return None
 
 
-def _lines_beside(f: Float[np.ndarray, " m"], steady: Float[np.ndarray, " m"], line: float, limit: float) -> int:
+def _lines_beside(f: VectorM, steady: VectorM, line: float, limit: float) -> int:
     """Return how many other lines stand out as much within an octave each side, the mains' own multiples left out."""
     inside = np.flatnonzero((f > 0.5 * line) & (f < 2.0 * line))
     count = 0
@@ -151,7 +150,7 @@ def _lines_beside(f: Float[np.ndarray, " m"], steady: Float[np.ndarray, " m"], l
     return count
 
 
-def _floor(f: Float[np.ndarray, " m"], steady: Float[np.ndarray, " m"], line: float) -> float:
+def _floor(f: VectorM, steady: VectorM, line: float) -> float:
     """Return the spectrum beside a line: the larger of the medians below and above it, for it may slope."""
     apart, clear = f - line, 3.0 * (f[1] - f[0]) + 0.5
     sides = [steady[(sign * apart > clear) & (sign * apart <= BESIDE_HZ)] for sign in (-1.0, 1.0)]

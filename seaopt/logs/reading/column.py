@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError, require_number, require_type
 from seaopt.logs.log.alignment import Rule
 from seaopt.records import record
+from seaopt.signals import VectorN
 from seaopt.units import factor, si_unit
 
 
@@ -85,7 +85,7 @@ class Column:
         if not np.isfinite(self.clock_offset_s):
             raise LogError(f'column "{self.column}": clock_offset_s = {self.clock_offset_s:g}; give seconds')
 
-    def to_si(self, values: Float[np.ndarray, " n"], unit: str, place: str) -> Float[np.ndarray, " n"]:
+    def to_si(self, values: VectorN, unit: str, place: str) -> VectorN:
         """Return the values in the SI unit of `unit`; the array given is used up."""
         if self.wrap_bits is not None:
             values = _decode_twos_complement(values, self.wrap_bits, f'{place}: column "{self.column}"')
@@ -115,7 +115,7 @@ def spell_column(**keys: str | int) -> str:
     return ", ".join(f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in keys.items())
 
 
-def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> int | None:
+def suspect_wrap(values: VectorN, low: float, high: float) -> int | None:
     """Return the bits of an unsigned field that seems to hold small signed numbers, from `low` to `high`."""
     # Small numbers of either sign leave the middle half of the unsigned range empty.
     bits = next((bits for bits in (8, 16, 32) if 0.75 * 2**bits <= high < 2**bits and 0 <= low < 0.25 * 2**bits), None)
@@ -127,7 +127,7 @@ def suspect_wrap(values: Float[np.ndarray, " n"], low: float, high: float) -> in
     return bits if whole and apart and np.ptp(small) > 0 and np.ptp(large) > 0 else None
 
 
-def _decode_twos_complement(values: Float[np.ndarray, " n"], bits: int, where: str) -> Float[np.ndarray, " n"]:
+def _decode_twos_complement(values: VectorN, bits: int, where: str) -> VectorN:
     """Return two's complement of unsigned integers."""
     whole = 2.0**bits
     valid = np.isnan(values) | ((values >= 0) & (values < whole) & (values == np.floor(values)))

@@ -7,13 +7,14 @@ missing; the recorder's time column does not, because it counts rows. The first 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from seaopt.errors import LogError
 from seaopt.formatting import format_count
 from seaopt.logs.quality.faults import LARGEST_COUNT
 from seaopt.options import option
 from seaopt.records import record
+from seaopt.signals import VectorM, VectorN
 
 MOST_PER_COUNT = 1_000_000
 
@@ -38,9 +39,7 @@ class Counter:
             shown = self.samples_per_count if abs(self.samples_per_count) < LARGEST_COUNT else "a number of many digits"
             raise LogError(f"Counter: samples_per_count = {shown}; give a whole number from 1 to {MOST_PER_COUNT}")
 
-    def open_gaps(
-        self, time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], place: str
-    ) -> tuple[Float[np.ndarray, " n"], str]:
+    def open_gaps(self, time: VectorN, values: VectorN, place: str) -> tuple[VectorN, str]:
         """Return time with the later samples moved by the lost ones, and a note of what was done. Raises LogError: the
         column is not a counter: not whole, or falling.
         """
@@ -64,7 +63,7 @@ class Counter:
         )
 
 
-def _count_losses(values: Float[np.ndarray, " n"], each: int) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+def _count_losses(values: VectorN, each: int) -> tuple[Int[np.ndarray, " m"], VectorM]:
     """Return where each count but the first begins, and how many samples are missing before it."""
     starts = np.flatnonzero(np.diff(values)) + 1
     skipped = (np.diff(values)[starts - 1] - 1.0) * each  # of integers the product could overflow

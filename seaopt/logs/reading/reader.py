@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError, require_number, require_type
 from seaopt.files import write_text
@@ -31,7 +30,7 @@ from seaopt.logs.reading.selection import (
     advise_time,
     select,
 )
-from seaopt.signals import Origin, Signal, Table
+from seaopt.signals import Origin, Signal, Table, VectorM, VectorN
 from seaopt.units import factor, si_unit
 
 
@@ -204,7 +203,7 @@ def _merge_duplicates(table: Table, how: str) -> Table:
     if starts.size == table.time.size:
         return table
 
-    def merge(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    def merge(values: VectorN) -> VectorM:
         if how == "first":
             return values[starts]
         there = np.isfinite(values)
@@ -230,7 +229,7 @@ def _hash_file(path: Path) -> str:
 
 def _read_channels(
     chosen: Selection, window: tuple[float, float] | None, counter: Counter | None
-) -> tuple[dict[str, Float[np.ndarray, " n"]], Float[np.ndarray, " n"], list[str]]:
+) -> tuple[dict[str, VectorN], VectorN, list[str]]:
     """Return the channels in their files' units and the clock in seconds, and what was done."""
     notes: list[str] = []
     # Each clock is read once, for all of its channels.
@@ -280,7 +279,7 @@ def _name_fields(group: Mapping[str, SelectedChannel]) -> list[str]:
 
 def _read_clock(
     clock: ClockColumn, names: list[str], window: tuple[float, float] | None
-) -> tuple[dict[str, Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]:
+) -> tuple[dict[str, VectorN], VectorN]:
     """Return columns that share a clock, and the clock in seconds, cut to the window."""
     if clock.rate_hz is not None:
         columns = clock.source.read(names)
@@ -307,17 +306,15 @@ def _read_clock(
 
 
 def _cut_window(
-    columns: dict[str, Float[np.ndarray, " n"]], time: Float[np.ndarray, " n"], window: tuple[float, float] | None
-) -> tuple[dict[str, Float[np.ndarray, " m"]], Float[np.ndarray, " m"]]:
+    columns: dict[str, VectorN], time: VectorN, window: tuple[float, float] | None
+) -> tuple[dict[str, VectorM], VectorM]:
     if window is None:
         return columns, time
     keep = (time >= window[0]) & (time <= window[1])
     return {name: values[keep] for name, values in columns.items()}, time[keep]
 
 
-def _separate_arrays(
-    group: Mapping[str, SelectedChannel], columns: dict[str, Float[np.ndarray, " n"]]
-) -> dict[str, Float[np.ndarray, " n"]]:
+def _separate_arrays(group: Mapping[str, SelectedChannel], columns: dict[str, VectorN]) -> dict[str, VectorN]:
     """Return an array of its own for each channel: two channels of one column are converted apart."""
     fields = _name_fields(group)
     counts = collections.Counter(fields)
@@ -337,9 +334,7 @@ def _widen_window(
     return window[0] - margin, window[1] + margin
 
 
-def _build_signal(
-    name: str, channel: SelectedChannel, values: Float[np.ndarray, " n"], clock: ClockColumn, digest: str
-) -> Signal:
+def _build_signal(name: str, channel: SelectedChannel, values: VectorN, clock: ClockColumn, digest: str) -> Signal:
     file_column, unit = channel.file_column, channel.unit
     path = str(file_column.source.path)
     steps = [file_column.column.describe_conversion(unit), "" if channel.clock == clock else str(channel.rule)]

@@ -20,7 +20,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex
 
 from seaopt.errors import PlantError, require_type, suggestion
 from seaopt.options import check_options, option
@@ -28,6 +28,7 @@ from seaopt.plants.memo import memo
 from seaopt.plants.plant import Plant
 from seaopt.plants.roles import Sampling
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 
 @record
@@ -60,7 +61,7 @@ class Difference:
         """Return a: how much of the way to each difference the lag goes; 1 without one."""
         return 1.0 if self.lag_hz is None else -math.expm1(-2.0 * math.pi * self.lag_hz * period_s)
 
-    def read(self, position: Float[np.ndarray, " n"], period_s: float) -> Float[np.ndarray, " n"]:
+    def read(self, position: VectorN, period_s: float) -> VectorN:
         """Return what the device makes of a recorded position, which was at rest before."""
         before = np.concatenate([np.repeat(position[:1], self.samples), position])[: position.size]
         out, share, level = (position - before) / (self.samples * period_s), self.share(period_s), 0.0

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-from jaxtyping import Float
-
 from seaopt.estimation.judgement.second_log import SECOND
 from seaopt.logs.quality.clock import ClockQuality
 from seaopt.problem.proposal.roles import Assignment
 from seaopt.problem.proposal.survey import LogSurvey
 from seaopt.problem.proposal.traits import Traits
 from seaopt.records import record
-from seaopt.signals import Signal, Table
+from seaopt.signals import Signal, Table, VectorN
 from seaopt.units import factor
 
 GEARED = (1.5, 1000.0)  # slopes of motor over link that are a gear's
@@ -50,7 +47,7 @@ class DescribedLog:
         return factor(self.units[role], SI_UNITS[role]) * self.scales.get(role, 1.0) if role in self.units else 1.0
 
     @property
-    def signals(self) -> dict[str, Float[np.ndarray, " n"]]:
+    def signals(self) -> dict[str, VectorN]:
         """Samples of each role in SI."""
         return {role: column.values * self.si_scale(role) for role, column in self.roles.columns.items()}
 

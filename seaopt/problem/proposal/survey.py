@@ -9,7 +9,6 @@ from dataclasses import field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError, suggestion
 from seaopt.formatting import join_words
@@ -22,6 +21,7 @@ from seaopt.logs.quality.findings import MOST_BRIDGED
 from seaopt.logs.reading.clock_samples import guess_time_unit, runs_on
 from seaopt.logs.reading.vocabulary import Header, is_count, is_named_time, read_header
 from seaopt.records import record
+from seaopt.signals import VectorM, VectorN
 from seaopt.units import factor, is_unit
 
 SLOW_HZ = 1.0
@@ -37,11 +37,11 @@ class SurveyedColumn:
     """A column as the file holds it; `values` are raw numbers in whatever unit it has."""
 
     header: Header
-    values: Float[np.ndarray, " n"]
+    values: VectorN
     # the column of its own times, or the format's own clock, where they are not the log's: `values` are then
     # interpolated to that
     clock: str = ""
-    readings: Float[np.ndarray, " m"] | None = None  # before they were interpolated, if they were
+    readings: VectorM | None = None  # before they were interpolated, if they were
     fast: bool = False  # whether its own times are too many for the log's to have each reading once
     hole: int = 0  # the largest number of rows that were empty in turn, and interpolated
 
@@ -166,7 +166,7 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
     )
 
 
-def _fill_column(header: Header, values: Float[np.ndarray, " n"], is_clock: bool) -> SurveyedColumn:
+def _fill_column(header: Header, values: VectorN, is_clock: bool) -> SurveyedColumn:
     """Return a column; one that has samples only in some rows, all over the log, with lines between them."""
     present = np.flatnonzero(np.isfinite(values))
     holes = np.diff(present) - 1
@@ -184,7 +184,7 @@ def _read_header(name: str, unit: str | None, *, odd: bool) -> Header:
     return read_header(name, brackets=False) if named else header
 
 
-def _is_time(header: Header, values: Float[np.ndarray, " n"]) -> bool:
+def _is_time(header: Header, values: VectorN) -> bool:
     """Tell whether a column is a time by its name, or the beginning of it and its samples: t_cell, not t_winding, and
     not T_w in degrees, which may only rise as well.
     """
@@ -193,7 +193,7 @@ def _is_time(header: Header, values: Float[np.ndarray, " n"]) -> bool:
     return rows > 1 and (header.quantity == "time" or (begins and runs_on(values[:rows])))
 
 
-def _read_raw(path: Path, fields: Mapping[str, Field]) -> dict[str, Float[np.ndarray, " n"]]:
+def _read_raw(path: Path, fields: Mapping[str, Field]) -> dict[str, VectorN]:
     """Return the numbers of columns as they are, without their units or clocks."""
     source = open_source(path)
     groups: dict[tuple[str | None, int | None], list[str]] = {}
@@ -203,7 +203,7 @@ def _read_raw(path: Path, fields: Mapping[str, Field]) -> dict[str, Float[np.nda
 
 
 def _group_by_clock(
-    fields: Sequence[Field], times: Sequence[str], raw: Mapping[str, Float[np.ndarray, " n"]]
+    fields: Sequence[Field], times: Sequence[str], raw: Mapping[str, VectorN]
 ) -> dict[str | None, list[str]]:
     """Return the columns of each clock, those of most samples first; of no clock those as long as most are. A column
     without a clock of the format's belongs to the time that has as many samples; of several of one length, to the
@@ -233,7 +233,7 @@ def _group_by_clock(
     return groups
 
 
-def _count_rows(values: Float[np.ndarray, " n"]) -> int:
+def _count_rows(values: VectorN) -> int:
     """Return how many samples a column has, without those missing at its end."""
     return int(np.flatnonzero(np.isfinite(values))[-1]) + 1 if np.any(np.isfinite(values)) else values.size
 
@@ -245,7 +245,7 @@ def _lead_with(clock: str, groups: Mapping[str | None, list[str]]) -> dict[str |
     return {clock: [*members], **{name: each for name, each in groups.items() if name != first}}
 
 
-def _read_unit(name: str, headers: Mapping[str, Header], raw: Mapping[str, Float[np.ndarray, " n"]]) -> str:
+def _read_unit(name: str, headers: Mapping[str, Header], raw: Mapping[str, VectorN]) -> str:
     """Return a clock's unit, by its header or the size of its steps."""
     header = headers[name]
     return header.unit if header.unit and header.quantity == "time" else guess_time_unit(raw[name])
@@ -255,7 +255,7 @@ def _move_to_clock(
     clock: SurveyedColumn,
     groups: Mapping[str, Sequence[str]],
     headers: Mapping[str, Header],
-    raw: Mapping[str, Float[np.ndarray, " n"]],
+    raw: Mapping[str, VectorN],
 ) -> tuple[dict[str, SurveyedColumn], tuple[float, float] | None]:
     """Return columns of other clocks, interpolated to the log's, and which part of the log all clocks have, in s."""
     if not groups:
@@ -279,7 +279,7 @@ def _move_to_clock(
     return moved, (low, high) if low < high else None
 
 
-def _describe_length(values: Float[np.ndarray, " n"], usual: int) -> str:
+def _describe_length(values: VectorN, usual: int) -> str:
     one = values.size == 1
     return f"one number beside the log, {values[0]:.6g}" if one else f"{values.size} samples, where the log has {usual}"
 
@@ -325,7 +325,7 @@ def find_leader(columns: Sequence[SurveyedColumn]) -> SurveyedColumn:
     )
 
 
-def _lead(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"]) -> float:
+def _lead(first: VectorN, second: VectorN) -> float:
     """Return by how many samples `first` leads `second`, weighted with how well they correlate."""
     a, b = (np.nan_to_num(np.diff(values)) for values in (first, second))
     a, b = a - np.mean(a), b - np.mean(b)
@@ -348,7 +348,7 @@ def share_of_jerk(column: SurveyedColumn, driver: SurveyedColumn) -> float:
     return max(regress(jerk[late:], push[1 : push.size - 1 - late])[1] for late in range(3))
 
 
-def slow_sign(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"], rate_hz: float) -> int:
+def slow_sign(first: VectorN, second: VectorN, rate_hz: float) -> int:
     """Return 1 where two columns move alike below 1 Hz, -1 where one falls as the other rises, else 0."""
     f = np.fft.rfftfreq(first.size, 1.0 / rate_hz)
     slow = (f > 0.0) & (f <= max(SLOW_HZ, 2.0 * rate_hz / first.size))
@@ -358,7 +358,7 @@ def slow_sign(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"], r
     return 0 if abs(alike) < ALIKE else 1 if alike > 0.0 else -1
 
 
-def regress(values: Float[np.ndarray, " n"], on: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def regress(values: VectorN, on: VectorN) -> tuple[float, float]:
     """Return the slope of a column on another, and the share of its variance that this explains."""
     good = np.isfinite(values) & np.isfinite(on)
     y, x = values[good] - np.mean(values[good]), on[good] - np.mean(on[good])

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import EstimationError
 from seaopt.estimation import Diagnostics, Fit, ModelledOutputs
 from seaopt.reporting.figures.panel import BAND, BLUE, COLOURS, LIMIT, MEASURED, Panel, draw_level, frequency_panel
 from seaopt.reporting.figures.thinning import describe_thinning, thin_series
+from seaopt.signals import VectorM, VectorN
 from seaopt.units import unit_after
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def outputs_panel(prediction: ModelledOutputs, span_s: tuple[float, float] | Non
     )
 
 
-def _find_busiest(values: Float[np.ndarray, " n"], time: Float[np.ndarray, " n"]) -> tuple[float, float]:
+def _find_busiest(values: VectorN, time: VectorN) -> tuple[float, float]:
     """Return the ends of the second about the sample farthest from the mean."""
     usable = np.where(np.isfinite(values), np.abs(values - np.nanmean(values)), 0.0)
     centre = float(time[int(np.argmax(usable))])
@@ -125,9 +125,7 @@ def spectrum_panel(prediction: ModelledOutputs) -> Panel:
     )
 
 
-def amplitude_density(
-    values: Float[np.ndarray, " n"], period: float
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+def amplitude_density(values: VectorN, period: float) -> tuple[VectorM, VectorM]:
     """Return frequencies and root power density of the longest whole run. Raises EstimationError: too short."""
     from scipy.signal import welch  # deferred: 0.3 s
 
@@ -142,7 +140,7 @@ def amplitude_density(
     return f[1:], np.sqrt(power[1:])
 
 
-def _find_longest_run(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+def _find_longest_run(values: VectorN) -> VectorM:
     """Return the longest run of finite samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isfinite(values).astype(int), [0]])))
     runs = edges.reshape(-1, 2)

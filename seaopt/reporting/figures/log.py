@@ -6,7 +6,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from seaopt.logs import Log, Quality, Table
 from seaopt.logs.quality.clock import ClockQuality
@@ -15,6 +14,7 @@ from seaopt.reporting.figures.fit import label_channel
 from seaopt.reporting.figures.panel import BLUE, COLOURS, GREEN, MEASURED, ORANGE, PINK, VERMILION, Panel
 from seaopt.reporting.figures.thinning import STRETCHES, break_at, describe_thinning, thin_series
 from seaopt.reporting.sections.kinds.quality import describe_jitter
+from seaopt.signals import RowsK, VectorM, VectorN
 from seaopt.welch import MEAN_SQUARE
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ def density_panel(quality: Quality, name: str) -> Panel:
     )
 
 
-def _measure_density(quality: Quality, name: str) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+def _measure_density(quality: Quality, name: str) -> tuple[VectorM, VectorM]:
     """Return the frequencies above 0 Hz and the root of the power density there; empty without a spectrum."""
     spectra = quality.spectra
     if spectra is None or name not in spectra.channels:
@@ -158,14 +158,7 @@ def _measure_density(quality: Quality, name: str) -> tuple[Float[np.ndarray, " m
     return spectra.frequency_hz[1:], density
 
 
-def _draw_series(
-    axis: Axes,
-    time: Float[np.ndarray, " n"],
-    values: Float[np.ndarray, " n"],
-    gaps: Int[np.ndarray, " k"],
-    colour: str,
-    label: str,
-) -> None:
+def _draw_series(axis: Axes, time: VectorN, values: VectorN, gaps: RowsK, colour: str, label: str) -> None:
     """Draw a channel over time, with nothing across a gap."""
     gaps = gaps[(gaps > 0) & (gaps < time.size)] if gaps.size <= MOST_MARKS else gaps[:0]
     ends = [0, *gaps.tolist(), time.size]
@@ -178,18 +171,16 @@ def _draw_series(
     axis.plot(*break_at(times, kept, starts), color=colour, linewidth=0.8, label=label)
 
 
-def _mark_spans(axis: Axes, time: Float[np.ndarray, " n"], runs: RowRanges, colour: str, label: str) -> None:
+def _mark_spans(axis: Axes, time: VectorN, runs: RowRanges, colour: str, label: str) -> None:
     ends = time[runs.start[:MOST_MARKS]], time[runs.stop[:MOST_MARKS] - 1]
     for start, stop in np.stack(ends, axis=1).tolist():
         axis.axvspan(start, stop, color=colour, alpha=0.35, linewidth=1.0, label=label)
 
 
-def _mark_gaps(axis: Axes, time: Float[np.ndarray, " n"], clock: ClockQuality) -> None:
+def _mark_gaps(axis: Axes, time: VectorN, clock: ClockQuality) -> None:
     _mark_spans(axis, time, RowRanges(start=clock.gaps - 1, stop=clock.gaps + 1), ORANGE, "gap")
 
 
-def _mark_lines(
-    axis: Axes, time: Float[np.ndarray, " n"], rows: Int[np.ndarray, " k"], colour: str, label: str
-) -> None:
+def _mark_lines(axis: Axes, time: VectorN, rows: RowsK, colour: str, label: str) -> None:
     for at in time[rows[:MOST_MARKS]].tolist():
         axis.axvline(at, color=colour, linewidth=1.0, label=label)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.control import Controller, Loop
 from seaopt.control.loops.loop import STABLE
@@ -15,6 +14,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.reporting.figures.fit import label_channel
 from seaopt.reporting.figures.panel import COLOURS, LIMIT, MEASURED, Panel, draw_level, frequency_panel, to_decibel
+from seaopt.signals import VectorM, VectorN
 from seaopt.units import unit_after
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def _style_loops(loops: Mapping[str, Loop]) -> Iterator[tuple[Loop, dict[str, An
         yield loop, {"color": COLOURS[number % len(COLOURS)], "linestyle": style, "linewidth": 1.4, "label": name}
 
 
-def list_frequencies(loop: Loop) -> Float[np.ndarray, " m"]:
+def list_frequencies(loop: Loop) -> VectorM:
     """Return the frequencies at which a loop's responses are drawn."""
     grid = loop.grid()
     return grid[(grid >= LOWEST_HZ) & (grid < 0.999 * loop.plant.nyquist_hz)]
@@ -102,7 +102,7 @@ def _is_stable(loop: Loop) -> bool:
     return bool(np.max(np.abs(loop.eigenvalues()), initial=0.0) < STABLE)
 
 
-def _settle(force: Float[np.ndarray, " n"]) -> int:
+def _settle(force: VectorN) -> int:
     """Return from which sample on a response stays within a hundredth of its last."""
     outside = np.flatnonzero(np.abs(force - force[-1]) > SETTLED * max(abs(float(force[-1])), 1e-12))
     return int(outside[-1]) + 1 if outside.size else 1

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from seaopt.frequency import Pair
 from seaopt.records import record
 from seaopt.reporting.figures.panel import BAND, MEASURED, Panel, frequency_panel, to_decibel
+from seaopt.signals import VectorM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,7 +63,7 @@ def response_panel(name: str, title: str, pair: Pair, curves: Sequence[Curve]) -
     )
 
 
-def _spread_lines(f: Float[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+def _spread_lines(f: VectorM) -> Bool[np.ndarray, " m"]:
     """Return which lines of an estimate are drawn: all, or those nearest to frequencies evenly spaced in log f."""
     drawn = np.full(f.size, f.size <= LINES)
     if f.size > LINES:

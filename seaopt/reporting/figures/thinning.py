@@ -7,15 +7,14 @@ of a series are drawn, too.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+
+from seaopt.signals import RowsK, VectorM, VectorN
 
 STRETCHES = 500
 METHOD = "least and largest sample of each of {} stretches (min-max)"
 
 
-def thin_series(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], stretches: int = STRETCHES
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+def thin_series(time: VectorN, values: VectorN, stretches: int = STRETCHES) -> tuple[VectorM, VectorM]:
     """Return at most two samples per stretch of equal length, and the ends; NaN where a stretch has no sample."""
     n = values.size
     if n <= 2 * stretches:
@@ -31,9 +30,7 @@ def thin_series(
     return time[kept], values[kept]
 
 
-def break_at(
-    time: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], gaps: Int[np.ndarray, " k"]
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+def break_at(time: VectorN, values: VectorN, gaps: RowsK) -> tuple[VectorM, VectorM]:
     """Return a series with a missing sample in front of each sample of a row number, so that no line joins them."""
     middles = 0.5 * (time[gaps - 1] + time[gaps])
     return np.insert(time, gaps, middles), np.insert(values, gaps, np.nan)

@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
 from matplotlib.markers import TICKDOWN, TICKLEFT
@@ -22,6 +22,7 @@ from matplotlib.ticker import NullLocator
 from matplotlib.transforms import offset_copy
 
 from seaopt.records import record
+from seaopt.signals import VectorM, VectorN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,9 +39,9 @@ class Side:
 
     axes: Axes
     name: str  # "x" or "y"
-    major: Float[np.ndarray, " n"]
+    major: VectorN
     labels: tuple[str, ...]
-    minor: Float[np.ndarray, " m"]
+    minor: VectorM
 
     @property
     def axis(self) -> Any:
@@ -52,7 +53,7 @@ class Side:
         """From data along the side, and a fraction of the axes across it, to the drawing."""
         return self.axes.get_xaxis_transform() if self.name == "x" else self.axes.get_yaxis_transform()
 
-    def add_line(self, along: Float[np.ndarray, " n"], across: Float[np.ndarray, " n"], **look: Any) -> None:
+    def add_line(self, along: VectorN, across: VectorN, **look: Any) -> None:
         """Add one line to the axes, below curves."""
         points = (along, across) if self.name == "x" else (across, along)
         self.axes.add_artist(Line2D(*points, transform=self.transform, zorder=DEPTH, **look))
@@ -91,7 +92,7 @@ def find_ticks(axes: Axes, name: str) -> Side:
     )
 
 
-def _in_view(axis: Any, values: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def _in_view(axis: Any, values: VectorN) -> Bool[np.ndarray, " n"]:
     """Tell which values lie between the ends of a side."""
     transform = axis.get_transform()
     low, high = np.sort(transform.transform(np.asarray(axis.get_view_interval(), dtype=float)))

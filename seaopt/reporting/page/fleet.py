@@ -7,7 +7,6 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from markupsafe import Markup
 
 from seaopt.files import write_text
@@ -16,6 +15,7 @@ from seaopt.records import record
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_parts, render_template
 from seaopt.reporting.sections.data import KeyFigure, Mark, Section
+from seaopt.signals import VectorM, VectorN
 
 WIDTH, HEIGHT, EDGE = 132.0, 30.0, 3.0  # of a drawing, in its units
 MOST_POINTS = 40  # of a drawing; runs beyond are averaged, those that follow each other
@@ -90,14 +90,7 @@ def write_page(
     return write_text(Path(path), html)
 
 
-def draw_trend(
-    times: Float[np.ndarray, " n"],
-    values: Float[np.ndarray, " n"],
-    stds: Float[np.ndarray, " n"],
-    *,
-    label: str,
-    since: float | None = None,
-) -> Markup:
+def draw_trend(times: VectorN, values: VectorN, stds: VectorN, *, label: str, since: float | None = None) -> Markup:
     """Return values over time as a small SVG: points joined by a line, one std up and down, and where a change began.
     `times`: in order, of at least two runs. `label`: what a screen reader says. `since`: from when on it is shaded.
     """
@@ -105,10 +98,10 @@ def draw_trend(
     low, high = float(np.min(level - spread)), float(np.max(level + spread))
     first, last = float(at[0]), float(at[-1])
 
-    def across(time: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def across(time: VectorN) -> VectorN:
         return EDGE + (WIDTH - 2 * EDGE) * (time - first) / ((last - first) or 1.0)
 
-    def down(value: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def down(value: VectorN) -> VectorN:
         return HEIGHT - EDGE - (HEIGHT - 2 * EDGE) * (value - low) / ((high - low) or 1.0)
 
     x = across(at)
@@ -128,9 +121,7 @@ def draw_trend(
     )
 
 
-def _average(
-    times: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], stds: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+def _average(times: VectorN, values: VectorN, stds: VectorN) -> tuple[VectorM, VectorM, VectorM]:
     """Return no more than `MOST_POINTS` points: means of runs that follow each other, of about as many each."""
     if values.size <= MOST_POINTS:
         return times, values, stds
