@@ -25,7 +25,15 @@ from jaxtyping import Float
 from seaopt.errors import PlantError
 from seaopt.parameters import ParameterSet
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import CompletedParameters, Plant, jacobians, name_parameters, name_symbols, state_space
+from seaopt.plants.plant import (
+    CompletedParameters,
+    Plant,
+    extend,
+    jacobians,
+    name_parameters,
+    name_symbols,
+    state_space,
+)
 from seaopt.plants.roles import Bristles, Friction, change_ports, with_values
 from seaopt.records import record
 from seaopt.signals import VectorN
@@ -295,26 +303,22 @@ def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
             u, {name: getattr(u, name) + each.stiffness(p) * each.coordinate(x, p) for name, each in stuck.items()}
         )
 
-    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        rates = {
+    def forget(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        return {
             bristles.state: plant.friction[name].velocity(x, p) - FORGETTING * getattr(x, bristles.state)
             for name, bristles in bristled.items()
         }
-        return {**plant.f(t, x, hold(x, u, p), p), **rates}
 
-    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return plant.h(t, x, hold(x, u, p), p)
-
-    return replace(
+    return extend(
         plant,
+        find_inputs=hold,
+        rates=forget,
         name=f"{plant.name} {state}",
         ports=change_ports(plant.ports, _choose_state, state),
         friction={
             name: _take_viscous(friction, partial(choose_slope, name, friction))
             for name, friction in plant.friction.items()
         },
-        f=f if bristled else plant.f,
-        h=h if bristled else plant.h,
     )
 
 

@@ -90,39 +90,12 @@ from seaopt.plants.sensors.deflection import keep_weights, read_deflection
 from seaopt.records import record
 
 Part = Literal[
-    "stribeck",
-    "load_friction",
-    "load_stribeck",
-    "load_square",
-    "lugre",
-    "hysteresis",
-    "backlash",
-    "hardening",
-    "spring_damping",
-    "screw_mode",
-    "droop",
-    "falling_torque",
-    "friction_drift",
-    "friction_direction",
-    "back_driving",
-    "cogging",
-    "stand",
-    "current_loop",
-    "load_cell",
-    "command_delay",
-    "measurement_delay",
-    "voltage_input",
-    "duty_input",
-    "supply_input",
-    "supply_sag",
-    "inductance",
-    "position_servo",
-    "servo_integral",
-    "servo_limit",
-    "servo_delay",
-    "deflection_sensor",
-    "thermal",
-]
+    "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
+    "spring_damping", "screw_mode", "droop", "falling_torque", "friction_drift", "friction_direction", "back_driving",
+    "cogging", "stand", "current_loop", "load_cell", "command_delay", "measurement_delay", "voltage_input",
+    "duty_input", "supply_input", "supply_sag", "inductance", "position_servo", "servo_integral", "servo_limit",
+    "servo_delay", "deflection_sensor", "thermal",
+]  # fmt: skip
 
 SHARPNESS = declare("n_h", 1.0, "-", 1.0, "how much at once it gives way, an exponent")
 LEAST_SHARE = 1e-6  # of y_h that it is deflected by at least, for its logarithm

@@ -283,6 +283,29 @@ def share_drive(made: Plant, plant: Plant) -> Plant:
     return replace(made, drive_offset_s=plant.drive_offset_s) if plant.drive_offset_s else made
 
 
+def extend(
+    plant: Plant,
+    *,
+    find_inputs: Callable[[Any, Any, Any], Any] = lambda x, u, p: u,
+    find_parameters: Callable[[Any], Any] = lambda p: p,
+    rates: Equations = lambda t, x, u, p: {},
+    readings: Equations = lambda t, x, u, p: {},
+    added: Iterable[Parameter] = (),
+    **fields: Any,
+) -> Plant:
+    """Return a plant inside another one: what it sees as its inputs follows from those of the other by (x, u, p), and
+    its parameters by p. `rates` and `readings`, of what the other sees, go beside its own or in their place, `added`
+    beside its parameters, and `fields` in the place of its own.
+    """
+
+    def widen(equations: Equations, more: Equations) -> Equations:
+        return lambda t, x, u, p: {**equations(t, x, find_inputs(x, u, p), find_parameters(p)), **more(t, x, u, p)}
+
+    parameters = {**plant.parameters, **{parameter.name: parameter for parameter in added}}
+    fields = {"parameters": parameters, **fields}
+    return replace(plant, f=widen(plant.f, rates), h=widen(plant.h, readings), **fields)
+
+
 def _restore_plant(content: Mapping[str, Any]) -> Plant:
     return Plant(**content)
 

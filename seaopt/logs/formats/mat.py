@@ -29,17 +29,9 @@ PEEK_BYTES = 1 << 16  # bytes that hold a variable's header
 COMPRESSED, MATRIX = 15, 14
 STRUCT, OPAQUE = 2, 17
 NUMBER_CLASSES = {
-    6: "float64",
-    7: "float32",
-    8: "int8",
-    9: "uint8",
-    10: "int16",
-    11: "uint16",
-    12: "int32",
-    13: "uint32",
-    14: "int64",
-    15: "uint64",
-}
+    6: "float64", 7: "float32", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16", 12: "int32", 13: "uint32",
+    14: "int64", 15: "uint64",
+}  # fmt: skip
 OTHER_CLASSES = {1: "a cell array", 3: OBJECT, 4: "text", 5: "a sparse matrix", 16: "a function"}
 STORED_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 COMPLEX, LOGICAL = 0x08, 0x02

@@ -48,24 +48,10 @@ SIDE_WORDS: dict[Side, frozenset[str]] = {
         "gelenk", "abtrieb", "last", "pendulum", "pendel", "lever", "hebel", "phi", "thetal",
     }),
 }  # fmt: skip
-COMMAND_WORDS = frozenset(
-    {
-        "cmd",
-        "command",
-        "commanded",
-        "goal",
-        "ref",
-        "reference",
-        "target",
-        "set",
-        "setpoint",
-        "des",
-        "desired",
-        "soll",
-        "demand",
-        "sp",
-    }
-)
+COMMAND_WORDS = frozenset({
+    "cmd", "command", "commanded", "goal", "ref", "reference", "target", "set", "setpoint", "des", "desired", "soll",
+    "demand", "sp",
+})  # fmt: skip
 MEASURED_WORDS = frozenset({"act", "actual", "meas", "measured", "ist", "present", "fb", "feedback"})
 DEFLECTION_WORDS = frozenset({"deflection", "defl", "compression", "auslenkung", "federweg", "twist", "stretch"})
 # Within a longer word, as German composes them: Motorstrom, Gelenkwinkel, Sollposition.

@@ -19,6 +19,7 @@ have values.
 from __future__ import annotations
 
 import math
+import operator
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -53,30 +54,24 @@ RESERVED = frozenset({*CONSTANTS, *FUNCTIONS})
 _REMEDIES = {"sign": 'smooth the jump, as in "tanh(v/v_s)"', "pow": 'write a power as "x^2"', "ln": 'write "log(x)"'}
 
 _COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
-    "<": lambda a, b: a < b,
-    "<=": lambda a, b: a <= b,
-    ">": lambda a, b: a > b,
-    ">=": lambda a, b: a >= b,
-    "==": lambda a, b: a == b,
-    "!=": lambda a, b: a != b,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
 }
 _ARITHMETIC: Mapping[str, Callable[[Any, Any], Any]] = {
-    "+": lambda a, b: a + b,
-    "-": lambda a, b: a - b,
-    "*": lambda a, b: a * b,
-    "/": lambda a, b: a / b,
-    "^": lambda a, b: a**b,
-    "**": lambda a, b: a**b,
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "^": operator.pow,
+    "**": operator.pow,
 }
 _COMPARISON, _SUM, _TERM, _SIGN, _POWER = 1, 2, 3, 4, 5
-_BINDING = dict.fromkeys(_COMPARISONS, _COMPARISON) | {
-    "+": _SUM,
-    "-": _SUM,
-    "*": _TERM,
-    "/": _TERM,
-    "^": _POWER,
-    "**": _POWER,
-}
+_BINDING = dict.fromkeys(_COMPARISONS, _COMPARISON) | dict.fromkeys(("^", "**"), _POWER)
+_BINDING |= dict.fromkeys("+-", _SUM) | dict.fromkeys("*/", _TERM)
 _TOKEN = re.compile(
     r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
     r"|(?P<name>[^\W\d]\w*)|(?P<sign>\*\*|[<>=!]=|[-+*/^(),<>])|(?P<other>\S)"
@@ -165,18 +160,18 @@ class _Parser:
         start = self.at
         value = self.read_operand(depth)
         while _BINDING.get(self.next.text, 0) > binding:
-            operator = self.take()
-            strength = _BINDING[operator.text]
+            sign = self.take()
+            strength = _BINDING[sign.text]
             if start in self.conditions:
                 what = "compare two numbers at a time" if strength == _COMPARISON else "a comparison is no number"
-                raise self.error(operator, f"{what}; write if_else(a > b, then, else)")
+                raise self.error(sign, f"{what}; write if_else(a > b, then, else)")
             # What stands behind a power is a factor of its own, so that powers start at their right.
             right = self.read_number(_SIGN, depth + 1) if strength == _POWER else self.read_number(strength, depth)
             if strength == _COMPARISON:
-                value = ca.SX(_COMPARISONS[operator.text](value, right))
+                value = ca.SX(_COMPARISONS[sign.text](value, right))
                 self.conditions.add(start)
             else:
-                value = self.check_finite(_ARITHMETIC[operator.text](value, right), operator)
+                value = self.check_finite(_ARITHMETIC[sign.text](value, right), sign)
         return value
 
     def read_operand(self, depth: int) -> Any:

@@ -43,7 +43,7 @@ import casadi as ca
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter, declare
 from seaopt.plants.friction import bound_slopes
-from seaopt.plants.plant import Plant, refuse_clash
+from seaopt.plants.plant import Plant, extend, refuse_clash
 from seaopt.plants.roles import Friction, SeriesSpring, change_ports, put_behind, with_values
 from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
 
@@ -286,20 +286,12 @@ def _change(
     parameters, one of p. `change` makes the same of the plants of its ports; `fields` are what else is another.
     """
     refuse_clash(plant, part, [parameter.name for parameter in parameters])
-
-    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return plant.f(t, x, find_inputs(x, u, p), find_parameters(p))
-
-    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return plant.h(t, x, find_inputs(x, u, p), find_parameters(p))
-
-    added = {parameter.name: parameter for parameter in parameters}
-    return replace(
+    return extend(
         plant,
+        find_inputs=find_inputs,
+        find_parameters=find_parameters,
+        added=parameters,
         name=f"{plant.name} with {part}",
-        f=f,
-        h=h,
-        parameters={**plant.parameters, **added},
         ports=change_ports(plant.ports, change),
         **fields,
     )

@@ -35,7 +35,7 @@ from seaopt.errors import PlantError, require_number
 from seaopt.formatting import html_text, join_words
 from seaopt.parameters import ParameterSet, declare
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import Plant, find_range, refuse_clash
+from seaopt.plants.plant import Plant, extend, find_range, refuse_clash
 from seaopt.plants.roles import Friction, Winding, change_ports, with_values
 from seaopt.records import record
 
@@ -125,23 +125,15 @@ def add_heat(plant: Plant) -> Plant:
             "actuation = Actuation(input, effort) with an input in A"
         )
     refuse_clash(plant, "thermal", (*RISES, *TEMPERATURES, *(parameter.name for parameter in PARAMETERS)))
-    source = actuation.input
-
-    def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        return {**plant.f(t, x, u, p), **_warm(getattr(u, source), x, p)}
-
-    def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        return {**plant.h(t, x, u, p), **_read_temperatures(x, p)}
-
-    return replace(
+    return extend(
         plant,
+        rates=lambda t, x, u, p: _warm(getattr(u, actuation.input), x, p),
+        readings=lambda t, x, u, p: _read_temperatures(x, p),
+        added=PARAMETERS,
         name=f"{plant.name} with heat",
-        f=f,
-        h=h,
         winding=Winding(rises=RISES, temperatures=TEMPERATURES, effort=actuation.effort, unit=actuation.unit),
         states={**plant.states, **dict.fromkeys(RISES, "K")},
         outputs={**plant.outputs, **dict.fromkeys(TEMPERATURES, "degC")},
-        parameters={**plant.parameters, **{parameter.name: parameter for parameter in PARAMETERS}},
         ports=change_ports(plant.ports, add_heat),
     )
 

@@ -16,7 +16,6 @@ Errors of the encoders are errors of what is computed from them: by :math:`\part
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -25,7 +24,7 @@ import casadi as ca
 
 from seaopt.errors import PlantError
 from seaopt.parameters import Parameter, declare
-from seaopt.plants.plant import CompletedParameters, Plant, name_parameters
+from seaopt.plants.plant import CompletedParameters, Plant, extend, name_parameters
 from seaopt.plants.roles import Sensing, change_ports
 from seaopt.units import ROTARY
 
@@ -49,14 +48,10 @@ def read_deflection(plant: Plant) -> Plant:
     if name in plant.outputs or NOMINAL in plant.parameters:
         raise PlantError(f'plant {plant.name}: part "deflection_sensor" has {name} and {NOMINAL}, which it has, too')
     deflection = spring.deflection
-
-    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return {**plant.h(t, x, u, p), name: getattr(p, NOMINAL) * deflection(x, p)}
-
-    return replace(
+    return extend(
         plant,
+        readings=lambda t, x, u, p: {name: getattr(p, NOMINAL) * deflection(x, p)},
         name=f"{plant.name} with deflection_sensor",
-        h=h,
         outputs={**plant.outputs, name: unit},
         parameters={**plant.parameters, NOMINAL: f"{unit}/{spring.unit}"},
         sensing=replace(sensing, regulated=(*sensing.regulated, name), from_encoders=(*sensing.from_encoders, name)),

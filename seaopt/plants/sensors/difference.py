@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -25,7 +23,7 @@ from jaxtyping import Complex
 from seaopt.errors import PlantError, require_type, suggestion
 from seaopt.options import check_options, option
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import Plant
+from seaopt.plants.plant import Plant, extend
 from seaopt.plants.roles import Sampling
 from seaopt.records import record
 from seaopt.signals import VectorN
@@ -98,17 +96,11 @@ def add_difference(plant: Plant, name: str, difference: Difference, period_s: fl
         reading = {behind: 1.0 - share, **{state: share * weight for state, weight in rate.items()}}
         sets[behind] = reading
 
-    def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return {**plant.f(t, x, u, p), **dict.fromkeys(states, 0.0)}
-
-    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return {**plant.h(t, x, u, p), name: sum(weight * getattr(x, state) for state, weight in reading.items())}
-
     before, made = (plant.sampling.sets, plant.sampling.differences) if plant.sampling is not None else ({}, {})
-    return replace(
+    return extend(
         plant,
-        f=f,
-        h=h,
+        rates=lambda t, x, u, p: dict.fromkeys(states, 0.0),
+        readings=lambda t, x, u, p: {name: sum(weight * getattr(x, state) for state, weight in reading.items())},
         states={**plant.states, **states},
         outputs={**plant.outputs, name: unit},
         sampling=Sampling(period_s=period_s, sets={**before, **sets}, differences={**made, name: difference}),
@@ -118,11 +110,7 @@ def add_difference(plant: Plant, name: str, difference: Difference, period_s: fl
 def read_positions(plant: Plant, differences: Mapping[str, Difference]) -> Plant:
     """Return a plant with differences in which these outputs are the positions themselves."""
     states = {name: find_state(plant, difference.of) for name, difference in differences.items()}
-
-    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        return {**plant.h(t, x, u, p), **{name: getattr(x, state) for name, state in states.items()}}
-
-    return replace(plant, h=h)
+    return extend(plant, readings=lambda t, x, u, p: {name: getattr(x, state) for name, state in states.items()})
 
 
 def find_state(plant: Plant, position: str) -> str:
