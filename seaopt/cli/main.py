@@ -369,8 +369,7 @@ def export(
     ] = None,
     tracking_time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Of the anti-windup.")] = None,
     derate: Annotated[
-        bool | None,
-        typer.Option(help='Lower the limit as the winding warms up; the plant needs the part "thermal".'),
+        bool | None, typer.Option(help='Lower the limit as the winding warms up; the plant needs the part "thermal".')
     ] = None,
     derate_margin: Annotated[
         float | None, typer.Option(metavar="KELVIN", help="Derate, and keep this far below T_max.")
@@ -535,8 +534,7 @@ def accept(
     ],
     output: Folder = OUT,
     reference: Annotated[
-        str | None,
-        typer.Option(metavar="COLUMN", help="Column of the law's reference; reference or ref if left out."),
+        str | None, typer.Option(metavar="COLUMN", help="Column of the law's reference; reference or ref if left out.")
     ] = None,
     stage: Annotated[
         str | None,
@@ -554,14 +552,7 @@ def accept(
     from seaopt.cli.machine import accept_logs
 
     met = accept_logs(
-        problem,
-        logs,
-        output,
-        reference=reference,
-        stage=stage,
-        at=at,
-        json=json,
-        amount=_choose_amount(quiet, verbose),
+        problem, logs, output, reference=reference, stage=stage, at=at, json=json, amount=_choose_amount(quiet, verbose)
     )
     _exit_unless(met)
 

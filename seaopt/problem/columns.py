@@ -57,11 +57,6 @@ def make_rule(table: AlignTable | None) -> Rule | None:
     """Return an alignment rule."""
     if table is None:
         return None
-    kinds: dict[str, Callable[..., Rule]] = {
-        "hold": Hold,
-        "linear": Linear,
-        "nearest": Nearest,
-        "readings": Readings,
-    }
+    kinds: dict[str, Callable[..., Rule]] = {"hold": Hold, "linear": Linear, "nearest": Nearest, "readings": Readings}
     (name,) = (name for name in kinds if getattr(table, name) is not None)
     return kinds[name](**getattr(table, name).model_dump(exclude_none=True))

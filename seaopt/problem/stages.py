@@ -31,13 +31,7 @@ from seaopt.control import (
     tune,
     tune_schedule,
 )
-from seaopt.control.laws.delay import (
-    DELAY_KEYS,
-    NEGLIGIBLE,
-    LoopSpec,
-    find_drive_delay,
-    settle_delays,
-)
+from seaopt.control.laws.delay import DELAY_KEYS, NEGLIGIBLE, LoopSpec, find_drive_delay, settle_delays
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.mpc.stored import check_described
@@ -202,13 +196,7 @@ def tune_problem(
         scheduled = {"over": schedule.over, "points": schedule.points, "bandwidths_hz": schedule.bandwidth_hz}
     if schedule is not None and not rounds:
         tuned = tune_schedule(
-            problem.design_plant,
-            values,
-            spec,
-            robust_to=robust_to,
-            **scheduled,
-            draws=draws,
-            progress=progress,
+            problem.design_plant, values, spec, robust_to=robust_to, **scheduled, draws=draws, progress=progress
         )
         return complete_schedule(problem, tuned, source)
     if not rounds:
