@@ -16,7 +16,7 @@ from seaopt.errors import LogError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
 from seaopt.formatting import format_count
 from seaopt.reporting.sections import judge
-from seaopt.reporting.sections.data import Commands, Reason, Verdict
+from seaopt.reporting.sections.data import Commands
 from seaopt.reporting.sections.text import LABEL
 
 if TYPE_CHECKING:
@@ -149,11 +149,10 @@ def _show(console: Terminal, fleet: Fleet, drift: Drift, *, verbose: bool) -> No
     if drift.left_out:
         total = format_count(len(fleet.rows), "log")
         console.wrap(f"left out of drift, of {total}: {drift.describe_left_out()}", indent=LABEL)
-    if drift.missing:
+    steady = judge(drift)
+    if steady is None:
         console.wrap(f"Drift: {drift.verdict}", indent=LABEL)
         return
-    alarms = tuple(Reason(what=f"{alarm.actuator}: {alarm.describe()}") for alarm in drift.alarms)
-    steady = Verdict(met=not alarms, text=f"Drift: {drift.verdict}", reasons=alarms, words=("steady", "alarm"))
     show_verdicts(console, [steady], verbose=verbose)
     if drift.history.warning:
         console.wrap(f"warning: {drift.history.warning}", indent=LABEL)

@@ -69,6 +69,8 @@ Workers = Annotated[
 Like = Annotated[
     str | None, typer.Option(metavar="EXPERIMENT", help="Read the log as this experiment's; the first if left out.")
 ]
+ClockColumn = Annotated[str | None, typer.Option(metavar="COLUMN", help="The clock's column.")]
+Taring = Annotated[str | None, typer.Option(metavar="STD:LIMIT", help="C that tares the force at rest.")]
 OUT = Path("out")
 
 
@@ -168,7 +170,7 @@ def frf(
 @app.command()
 def inspect(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A raw log, of any format.", show_default=False)],
-    time: Annotated[str | None, typer.Option(metavar="COLUMN", help="The clock's column.")] = None,
+    time: ClockColumn = None,
     channel: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=COLUMN", help="A channel; all numeric columns if left out. Repeatable."),
@@ -233,7 +235,7 @@ def new(
         bool, typer.Option("--yes", "-y", help="Ask nothing; take the best guesses and mark them as guesses.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    time: Annotated[str | None, typer.Option(metavar="COLUMN", help="The clock's column.")] = None,
+    time: ClockColumn = None,
     channel: Annotated[
         list[str] | None,
         typer.Option(metavar="ROLE=COLUMN", help="A column's role, such as I, tau_s, theta_m, F1. Repeatable."),
@@ -291,8 +293,8 @@ def validate(
     """Score the fit in DIR on another log, and compare its values with those that the log has alone."""
     from seaopt.cli.session import Session
 
-    if not Session(problem, output, design=False).validate(log, like, json, _choose_amount(quiet, verbose)):
-        raise typer.Exit(1)
+    session = Session(problem, output, design=False)
+    _exit_unless(session.validate(log, like, json, _choose_amount(quiet, verbose)))
 
 
 def _add_stage(stage: str, text: str) -> None:
@@ -389,7 +391,7 @@ def export(
     ] = None,
     no_gate: Annotated[bool, typer.Option("--no-gate", help="Leave out the problem file's gate.")] = False,
     log_rows: Annotated[int | None, typer.Option(metavar="N", help="C that logs each tick in a ring.")] = None,
-    tare: Annotated[str | None, typer.Option(metavar="STD:LIMIT", help="C that tares the force at rest.")] = None,
+    tare: Taring = None,
     allow_infeasible: Annotated[
         bool, typer.Option("--allow-infeasible", help="Write a controller that misses its limits too; exit with 1.")
     ] = False,
@@ -505,7 +507,7 @@ def bringup(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE", help="Largest magnitude of an output: force, travel. Repeatable."),
     ] = None,
-    tare: Annotated[str | None, typer.Option(metavar="STD:LIMIT", help="C that tares the force at rest.")] = None,
+    tare: Taring = None,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,

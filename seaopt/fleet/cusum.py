@@ -37,6 +37,8 @@ from seaopt.errors import SeaoptError
 from seaopt.records import record
 from seaopt.signals import VectorN
 
+Runs = Float[np.ndarray, "actuators runs"]
+
 ALLOWANCE = 0.5  # k: best for a change of one standard deviation
 CLIP = 4.0
 STATES = 200  # of the Markov chain: average run lengths are right within 0.1 %
@@ -97,17 +99,17 @@ class Charts:
     """Charts of one parameter: a row per actuator, a column per run."""
 
     # innovations over their stds; nan at the first run and where there is none
-    ratios: Float[np.ndarray, "actuators runs"]
-    innovations: Float[np.ndarray, "actuators runs"]  # the same as they counted
+    ratios: Runs
+    innovations: Runs  # the same as they counted
     # upper, lower: S+ and S-
-    upper: Float[np.ndarray, "actuators runs"]
-    lower: Float[np.ndarray, "actuators runs"]
+    upper: Runs
+    lower: Runs
     alarm: Int[np.ndarray, " actuators"]  # at which run the alarm was raised; -1 for none
 
 
 def chart_runs(
-    values: Float[np.ndarray, "actuators runs"],
-    variances: Float[np.ndarray, "actuators runs"],
+    values: Runs,
+    variances: Runs,
     threshold: float,
     *,
     between: float = 0.0,
@@ -167,12 +169,7 @@ def chart_runs(
 
 
 def _start(
-    values: Float[np.ndarray, "actuators runs"],
-    variances: Float[np.ndarray, "actuators runs"],
-    between: float,
-    correlation: float,
-    scale: float,
-    dof: float,
+    values: Runs, variances: Runs, between: float, correlation: float, scale: float, dof: float
 ) -> tuple[VectorN, VectorN, VectorN]:
     """Return the mean of the first runs, its variance, and its covariance with u of the last of them. They tell mean
     and u together, and nothing of u alone. Of several runs it is the most likely mean of Student's t.

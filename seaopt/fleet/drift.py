@@ -194,9 +194,9 @@ class _Runs:
 
     actuators: list[str]
     places: Int[np.ndarray, "actuators runs"]  # rows of the history; -1 for none
-    times: Float[np.ndarray, "actuators runs"]
-    values: Float[np.ndarray, "actuators runs"]
-    variances: Float[np.ndarray, "actuators runs"]  # of the fits
+    times: Runs
+    values: Runs
+    variances: Runs  # of the fits
 
 
 def find_drift(

@@ -45,6 +45,12 @@ from seaopt.formatting import format_count, format_number
 from seaopt.records import Worded, record
 from seaopt.signals import VectorK
 
+# Of p parameters: one vector or matrix, and those of n logs.
+Vector = Float[np.ndarray, " p"]
+Square = Float[np.ndarray, "p p"]
+Vectors = Float[np.ndarray, "n p"]
+Squares = Float[np.ndarray, "n p p"]
+
 CONFIDENT = 1.959964  # standard deviations of a 95 % interval
 RELATIVE = 0.25  # std over value, up to which a positive parameter is taken by its logarithm
 ADJUSTED = 2  # what the factor |T| of the likelihood takes from the number that a mean square is divided by
@@ -80,9 +86,9 @@ class Population(Worded):
     names: tuple[str, ...]
     units: Mapping[str, str]
     logarithmic: tuple[bool, ...]
-    mean: Float[np.ndarray, " p"]
-    between: Float[np.ndarray, "p p"]
-    within: Float[np.ndarray, "p p"]
+    mean: Vector
+    between: Square
+    within: Square
     table: pl.DataFrame
     left_out: Mapping[str, int]
 
@@ -113,8 +119,8 @@ PARTS = ("", "_std", "_low", "_high", "_own", "_own_std")  # columns of a parame
 class _Logs:
     """Estimates of n logs of k actuators in scaled coordinates."""
 
-    values: Float[np.ndarray, "n p"]
-    covariances: Float[np.ndarray, "n p p"]
+    values: Vectors
+    covariances: Squares
     whose: Int[np.ndarray, " n"]  # actuators, from 0, each with a log at least
 
     @property
@@ -131,8 +137,8 @@ class _Logs:
 class _Posterior:
     """The posterior of the actuators, given T and R."""
 
-    mean: Float[np.ndarray, " p"]  # mu
-    mean_covariance: Float[np.ndarray, "p p"]  # W
+    mean: Vector  # mu
+    mean_covariance: Square  # W
     own: Float[np.ndarray, "k p"]  # their logs together
     own_covariances: Float[np.ndarray, "k p p"]  # V
     shrinkage: Float[np.ndarray, "k p p"]  # B
@@ -232,9 +238,7 @@ def _select_rows(rows: pl.DataFrame, names: Sequence[str]) -> tuple[pl.DataFrame
     return leave_out(rows, conditions)
 
 
-def _prepare(
-    rows: pl.DataFrame, names: Sequence[str]
-) -> tuple[_Logs, tuple[bool, ...], Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+def _prepare(rows: pl.DataFrame, names: Sequence[str]) -> tuple[_Logs, tuple[bool, ...], Vector, Vector]:
     """Return the logs in coordinates of about unit size, which of these are logarithms, their offsets and scales."""
     values = rows.select(names).to_numpy().astype(float)
     stds = rows.select(f"{name}_std" for name in names).to_numpy().astype(float)
@@ -264,7 +268,7 @@ def _thin(logs: _Logs) -> _Logs:
     return _Logs(values=logs.values[kept], covariances=logs.covariances[kept], whose=logs.whose[kept] // step)
 
 
-def _infer(logs: _Logs, between: Float[np.ndarray, "p p"], within: Float[np.ndarray, "p p"]) -> _Posterior:
+def _infer(logs: _Logs, between: Square, within: Square) -> _Posterior:
     """Return what is known of the actuators, given T and R."""
     weights = np.linalg.inv(logs.covariances + within)
     own_covariances = _mirror(np.linalg.inv(logs.add_up(weights)))
@@ -286,7 +290,7 @@ def _infer(logs: _Logs, between: Float[np.ndarray, "p p"], within: Float[np.ndar
     )
 
 
-def _estimate_covariances(logs: _Logs) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "p p"]]:
+def _estimate_covariances(logs: _Logs) -> tuple[Square, Square]:
     """Return T and R by expectation maximisation; R is zero where no actuator has several logs."""
     size, count = logs.values.shape[1], logs.actuators
     repeated = logs.whose.size - count > size
@@ -304,7 +308,7 @@ def _estimate_covariances(logs: _Logs) -> tuple[Float[np.ndarray, "p p"], Float[
     return between, within
 
 
-def _renew_within(logs: _Logs, posterior: _Posterior, within: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+def _renew_within(logs: _Logs, posterior: _Posterior, within: Square) -> Square:
     """Return the next R: the expected square of what each log differs by from its actuator."""
     gain = within @ np.linalg.inv(logs.covariances + within)
     away = _square(logs.values - posterior.values[logs.whose]) + posterior.covariances[logs.whose]
@@ -312,9 +316,7 @@ def _renew_within(logs: _Logs, posterior: _Posterior, within: Float[np.ndarray, 
     return _mirror(spread.sum(axis=0) / (logs.whose.size - ADJUSTED))
 
 
-def _propagate_sampling(
-    posterior: _Posterior, between: Float[np.ndarray, "p p"], count: int
-) -> Float[np.ndarray, "k p p"]:
+def _propagate_sampling(posterior: _Posterior, between: Square, count: int) -> Float[np.ndarray, "k p p"]:
     """Return the covariance of the posterior values by the sampling error of T, of which REML's information tells. With
     E_a the derivative of T by its a-th entry, dm_i/dT_a = (I - B_i) E_a (T + V_i)^-1 (y_i - mu).
     """
@@ -340,11 +342,11 @@ def _restore(values: VectorK, stds: VectorK, logarithmic: bool) -> tuple[VectorK
     )
 
 
-def _times(matrices: Float[np.ndarray, "n p p"], vectors: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n p"]:
+def _times(matrices: Squares, vectors: Vectors) -> Vectors:
     return (matrices @ vectors[..., None])[..., 0]
 
 
-def _square(vectors: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n p p"]:
+def _square(vectors: Vectors) -> Squares:
     return vectors[:, :, None] * vectors[:, None, :]
 
 
@@ -352,5 +354,5 @@ def _mirror(matrices: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "... p 
     return (matrices + matrices.mT) / 2
 
 
-def _compare(new: Float[np.ndarray, "p p"], old: Float[np.ndarray, "p p"]) -> float:
+def _compare(new: Square, old: Square) -> float:
     return float(np.max(np.abs(new - old)) / np.max(np.abs(new)))

@@ -29,6 +29,7 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.stats import chi2, norm, t
 
 from seaopt.codec import OrInfinite
+from seaopt.fleet.cusum import Runs
 from seaopt.formatting import format_number
 from seaopt.records import record
 from seaopt.signals import VectorN
@@ -51,8 +52,6 @@ FIRST_OF_HEAVY = 6  # runs that a baseline starts from below that: a wild one al
 CHANCE = 6.0  # by which twice the log-likelihood must rise for heavy tails: 1 % of normal fleets do
 
 BETWEEN_HEAD = ("std between runs", "correlation", "tails, as t of", "of pairs")
-
-Runs = Float[np.ndarray, "actuators runs"]
 
 
 @record

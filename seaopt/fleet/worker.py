@@ -25,10 +25,11 @@ import numpy as np
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Experiment, Fit
+from seaopt.estimation.result.findings import FitFinding
 from seaopt.fleet.logs import FleetLog, open_local
 from seaopt.fleet.plan import VERSION, Plan, name_correlation
 from seaopt.logs.quality.clock import assess_clock
-from seaopt.logs.quality.findings import find_clock_faults
+from seaopt.logs.quality.findings import Finding, find_clock_faults
 from seaopt.problem import Problem, fit_problem
 
 Row = dict[str, Any]
@@ -103,11 +104,12 @@ def _describe_fit(plan: Plan, log: FleetLog, known: str | None) -> Row:
 def _find_gaps(experiment: Experiment) -> list[dict[str, str]]:
     """Return the finding of a log with gaps, in the words of `seaopt inspect`; a fit alone bears them."""
     log = experiment.log
-    return [
-        {"severity": finding.severity, "kind": finding.kind, "where": experiment.name, "text": finding.sentence}
-        for finding in find_clock_faults(assess_clock(log.time, log.source), log.time)
-        if finding.kind == GAP
-    ]
+    faults = find_clock_faults(assess_clock(log.time, log.source), log.time)
+    return [_note(fault, experiment.name, fault.sentence) for fault in faults if fault.kind == GAP]
+
+
+def _note(finding: Finding | FitFinding, where: str, text: str) -> dict[str, str]:
+    return {"severity": finding.severity, "kind": finding.kind, "where": where, "text": text}
 
 
 def describe(fitted: Fit, name: str) -> Row:
@@ -129,12 +131,8 @@ def describe(fitted: Fit, name: str) -> Row:
         row |= {short: figure.value, f"{short}_std": figure.std}
     for output, figures in fitted.outputs[name].items():
         row |= {f"fit_percent_{output}": figures.fit_percent, f"rms_residual_{output}": figures.rms_residual}
-    findings = [
-        {"severity": finding.severity, "kind": finding.kind, "where": finding.where, "text": finding.text}
-        for finding in fitted.findings
-    ]
     return row | {
-        "findings": findings,
+        "findings": [_note(finding, finding.where, finding.text) for finding in fitted.findings],
         "fit_status": fitted.status,
         "samples": fitted.samples,
         "iterations": fitted.iterations,

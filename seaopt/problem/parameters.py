@@ -11,7 +11,7 @@ from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, known_parameters
 from seaopt.plants.motor.thermal import list_guessed_heat
-from seaopt.problem.bench_tables import ParameterTable
+from seaopt.problem.bench_tables import ParameterTable, UnknownTable
 from seaopt.problem.schema import ProblemTable
 from seaopt.units import ROTARY, factor, unit_after
 
@@ -60,7 +60,7 @@ def make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Paramet
             raise ProblemError(f'parameters: unknown parameter "{name}"; {remedy}')
         given = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
         try:
-            parameters[name] = _make_parameter(parameters[name], given)
+            parameters[name] = make_parameter(parameters[name], given)
         except UnitError as error:
             raise UnitError(f"parameters.{name}: {error}") from error
     return ParameterSet(parameters.values())
@@ -123,8 +123,10 @@ def _check_defaults(plants: Mapping[str, Plant], stated: Mapping[str, Collection
                 )
 
 
-def _make_parameter(default: Parameter, table: ParameterTable) -> Parameter:
-    scale = factor(table.unit, default.unit) if table.unit is not None else 1.0
+def make_parameter(default: Parameter, table: UnknownTable) -> Parameter:
+    """Return a parameter with a file's value and bounds, in its own unit."""
+    unit = table.unit if isinstance(table, ParameterTable) else None
+    scale = factor(unit, default.unit) if unit is not None else 1.0
     prior = None if table.prior_std is None else table.prior_std * scale
     free = table.free if table.free is not None else prior is not None
     low = default.min if table.min is None else table.min * scale

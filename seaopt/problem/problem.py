@@ -43,6 +43,7 @@ from seaopt.problem.bench_tables import (
 from seaopt.problem.columns import check_links, list_log_files, make_column, make_rule
 from seaopt.problem.equations import list_partners, list_unused, order_plants
 from seaopt.problem.option_tables import make_record
+from seaopt.problem.parameters import make_parameter
 from seaopt.problem.references import RESPONSE, guess_remarks, range_remarks
 from seaopt.problem.schema import ControllerTable, ProblemTable, RobustnessTable, ScheduleTable
 from seaopt.records import record
@@ -470,9 +471,5 @@ def _virtual_outputs(plant: Plant, table: VirtualTable) -> tuple[str, ...]:
 
 
 def _make_unknown(name: str, unit: str, table: float | UnknownTable) -> float | Parameter:
-    if not isinstance(table, UnknownTable):
-        return table
-    free = table.free if table.free is not None else table.prior_std is not None
-    known = Parameter(name=name, value=table.value, unit=unit, free=free, prior_std=table.prior_std)
-    low = known.min if table.min is None else table.min
-    return replace(known, min=low, max=known.max if table.max is None else table.max)
+    made = Parameter(name=name, value=0.0, unit=unit)
+    return make_parameter(made, table) if isinstance(table, UnknownTable) else table

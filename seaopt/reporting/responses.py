@@ -14,7 +14,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
 from seaopt.progress import Progress, count_off
 from seaopt.records import record
-from seaopt.reporting.comparison import experiment_survey
+from seaopt.reporting.comparison import experiment_survey, view_sensors
 from seaopt.reporting.files import write_frequency_figure
 
 
@@ -73,9 +73,8 @@ def estimate_responses(
         try:
             surveys[experiment.name] = experiment_survey(experiment, stretch_s=stretch_s)
             if fit is not None and experiment.name in fit.nuisance:
-                survey, nuisance = surveys[experiment.name], fit.nuisance[experiment.name]
-                clock = replace(survey.clock, delay_s=nuisance.delay_s, delay_free=False)
-                fitted[experiment.name] = (replace(survey, clock=clock, gain=nuisance.gain), fit)
+                pairs = surveys[experiment.name].pairs
+                fitted[experiment.name] = (replace(view_sensors(experiment, fit), pairs=pairs), fit)
         except LogError as error:
             raise LogError(f"{problem.source}: experiment {experiment.name}: {error}") from error
     progress(", ".join(surveys), 1.0)

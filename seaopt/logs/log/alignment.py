@@ -14,8 +14,24 @@ TICK = 1e-9  # seconds within which two instants are one: an offset that is take
 MOST_PACE = 1.25  # readings for an instant: of a faster clock `Readings` would leave out too many
 
 
+class _Reaching:
+    """A rule whose one option, where it has one, says how far from an instant it looks for samples."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            if not self.reach_s > 0:
+                raise LogError(f"{type(self).__name__}: {name} = {self.reach_s:g} must be above 0; give seconds")
+
+    @property
+    def reach_s(self) -> float:
+        """How far from an instant the rule looks for samples."""
+        return next((getattr(self, name) for name in self.__slots__), np.inf)
+
+
 @record
-class Hold:
+class Hold(_Reaching):
     """The last sample at or before each instant: commands, switches, and what a controller saw.
 
     Parameters
@@ -32,14 +48,6 @@ class Hold:
 
     max_age_s: float = np.inf
 
-    def __post_init__(self) -> None:
-        _check_positive("Hold", "max_age_s", self.max_age_s)
-
-    @property
-    def reach_s(self) -> float:
-        """How far from an instant the rule looks for samples."""
-        return self.max_age_s
-
     def __call__(self, at: VectorN, time: VectorM, values: VectorM) -> VectorN:
         """Return the values at the instants `at`, NaN where the rule has none."""
         before, _, inside = _neighbours(at, time)
@@ -47,7 +55,7 @@ class Hold:
 
 
 @record
-class Linear:
+class Linear(_Reaching):
     """The straight line between the samples on either side: quantities that are smooth between samples.
 
     Parameters
@@ -64,14 +72,6 @@ class Linear:
 
     max_gap_s: float = np.inf
 
-    def __post_init__(self) -> None:
-        _check_positive("Linear", "max_gap_s", self.max_gap_s)
-
-    @property
-    def reach_s(self) -> float:
-        """How far from an instant the rule looks for samples."""
-        return self.max_gap_s
-
     def __call__(self, at: VectorN, time: VectorM, values: VectorM) -> VectorN:
         """Return the values at the instants `at`, NaN where the rule has none."""
         before, after, inside = _neighbours(at, time)
@@ -84,7 +84,7 @@ class Linear:
 
 
 @record
-class Nearest:
+class Nearest(_Reaching):
     """The sample nearest in time, if it is within the tolerance: clocks of one rate with a little jitter.
 
     Parameters
@@ -101,14 +101,6 @@ class Nearest:
 
     tolerance_s: float
 
-    def __post_init__(self) -> None:
-        _check_positive("Nearest", "tolerance_s", self.tolerance_s)
-
-    @property
-    def reach_s(self) -> float:
-        """How far from an instant the rule looks for samples."""
-        return self.tolerance_s
-
     def __call__(self, at: VectorN, time: VectorM, values: VectorM) -> VectorN:
         """Return the values at the instants `at`, NaN where the rule has none."""
         before, after, inside = _neighbours(at, time)
@@ -117,7 +109,7 @@ class Nearest:
 
 
 @record
-class Readings:
+class Readings(_Reaching):
     """Each sample once, at the instant nearest to it, to which the cubic through four samples takes it; elsewhere there
     is none: outputs of a slower or a shifted clock, of which lines between samples would make more than was measured.
     Nothing is taken across a hole of the channel. A clock of more than 1.25 times the log's rate is refused (LogError).
@@ -129,11 +121,6 @@ class Readings:
     >>> Readings()(np.arange(7.0), time, time**3).round(9).tolist()
     [nan, nan, 8.0, nan, 64.0, nan, 216.0]
     """
-
-    @property
-    def reach_s(self) -> float:
-        """How far from an instant the rule looks for samples."""
-        return np.inf
 
     def __call__(self, at: VectorN, time: VectorM, values: VectorM) -> VectorN:
         """Return the values at the instants `at`, NaN where the rule has none."""
@@ -216,8 +203,3 @@ def _neighbours(at: VectorN, time: VectorM) -> tuple[np.ndarray, np.ndarray, Boo
     before = np.clip(np.searchsorted(time, at + TICK, side="right") - 1, 0, time.size - 1)
     after = np.minimum(before + 1, time.size - 1)
     return before, after, (at >= time[0] - TICK) & (at <= time[-1] + TICK)
-
-
-def _check_positive(rule: str, name: str, value: float) -> None:
-    if not value > 0:
-        raise LogError(f"{rule}: {name} = {value:g} must be above 0; give seconds")

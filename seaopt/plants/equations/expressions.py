@@ -70,8 +70,10 @@ _ARITHMETIC: Mapping[str, Callable[[Any, Any], Any]] = {
     "**": operator.pow,
 }
 _COMPARISON, _SUM, _TERM, _SIGN, _POWER = 1, 2, 3, 4, 5
-_BINDING = dict.fromkeys(_COMPARISONS, _COMPARISON) | dict.fromkeys(("^", "**"), _POWER)
-_BINDING |= dict.fromkeys("+-", _SUM) | dict.fromkeys("*/", _TERM)
+_BINDING = {
+    **dict.fromkeys(_COMPARISONS, _COMPARISON), **dict.fromkeys("+-", _SUM), **dict.fromkeys("*/", _TERM),
+    **dict.fromkeys(("^", "**"), _POWER),
+}  # fmt: skip
 _TOKEN = re.compile(
     r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
     r"|(?P<name>[^\W\d]\w*)|(?P<sign>\*\*|[<>=!]=|[-+*/^(),<>])|(?P<other>\S)"
