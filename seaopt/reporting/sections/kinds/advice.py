@@ -44,19 +44,14 @@ def _describe_diagnostics(diagnostics: Diagnostics) -> list[Section]:
         if test.p < SIGNIFICANCE
     )
     heads = ("experiment", "output", "simulated %", "one sample ahead %", "whiteness p")
+    heads = (*heads, "input", "worst lag", "over bound")
+    tests = Table(label="Tests of the residuals", head=heads, rows=tuple(rows), align="<<>>><>>")
     sections = [
         Section(
             title="Diagnostics",
             part="diagnostics",
             sentences=diagnostics.sentences or (NO_PROBLEM,),
-            tables=(
-                Table(
-                    label="Tests of the residuals",
-                    head=(*heads, "input", "worst lag", "over bound"),
-                    rows=tuple(rows),
-                    align="<<>>><>>",
-                ),
-            ),
+            tables=(tests,),
             remarks=(
                 *fixed,
                 "In brackets: held out. Even a residual that follows nothing exceeds its bound at some lags; the "
@@ -96,19 +91,14 @@ def _describe_ranking(ranking: Ranking) -> list[Section]:
         )
         for row in ranking.rows
     )
+    head = ("fit", "effective BIC", "BIC", "AIC", "unknowns", "simulated (held out) %")
+    table = Table(label="Fits compared", head=head, rows=rows, align="<>>>><")
     return [
         Section(
             title="Ranking",
             part="ranking",
             sentences=ranking.sentences,
-            tables=(
-                Table(
-                    label="Fits compared",
-                    head=("fit", "effective BIC", "BIC", "AIC", "unknowns", "simulated (held out) %"),
-                    rows=rows,
-                    align="<>>>><",
-                ),
-            ),
+            tables=(table,),
             remarks=(
                 f"The residuals are coloured: {format_number(ranking.effective_samples, 3)} of {ranking.samples} "
                 "samples count as independent. Differences of BIC beyond 10 are very strong evidence.",

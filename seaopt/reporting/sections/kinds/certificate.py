@@ -236,17 +236,8 @@ def _describe_logs(certificate: Certificate) -> Iterator[Section]:
         )
         for verdict in certificate.logs
     )
-    head = (
-        "log",
-        "samples",
-        "says",
-        "Ms measured",
-        "predicted",
-        "at Hz",
-        "at least",
-        "tells at Hz",
-        "rms of the input",
-    )
+    figures = ("Ms measured", "predicted", "at Hz", "at least", "tells at Hz")
+    head = ("log", "samples", "says", *figures, "rms of the input")
     if rows:
         yield Section(
             title="What the logs of the fit say of the loop",
@@ -347,19 +338,13 @@ def _describe_uncertainty(certificate: Certificate) -> Iterator[Section]:
         )
         for each in certificate.varied
     )
+    head = ("varied", "distribution", "nominal", "std", "from", "to", "unit")
     yield Section(
         title="Probability of failure",
         part="certificate",
         screen=False,
         sentences=(f"{draws}, seed {draws.seed}." if draws.samples else f"{draws}.",),
-        tables=(
-            Table(
-                label="What is drawn",
-                head=("varied", "distribution", "nominal", "std", "from", "to", "unit"),
-                rows=varied,
-                align="<<>>>><",
-            ),
-        ),
+        tables=(Table(label="What is drawn", head=head, rows=varied, align="<<>>>><"),),
     )
     disks = tuple(
         (
@@ -374,16 +359,11 @@ def _describe_uncertainty(certificate: Certificate) -> Iterator[Section]:
         for name, margins in certificate.margins.items()
         for kind, disk in margins.margins.disks.items()
     )
+    head = ("plant", "disk", "size", "at Hz", "factor on the loop", "gains inside", "phases inside °")
     yield Section(
         title="Smallest destabilising perturbations",
         part="certificate",
         folded=True,
-        tables=(
-            Table(
-                head=("plant", "disk", "size", "at Hz", "factor on the loop", "gains inside", "phases inside °"),
-                rows=disks,
-                align="<<>>>>>",
-            ),
-        ),
+        tables=(Table(head=head, rows=disks, align="<<>>>>>"),),
         remarks=("The loop survives every factor inside the disk; the factor named puts a pole on the unit circle.",),
     )

@@ -63,6 +63,10 @@ def _describe_environments(stability: StabilityMap) -> Section:
     called, worst = stability.called, stability.worst
     count, unstable = stability.stable.size, np.count_nonzero(~stability.stable)
     growth = "dies out" if worst.doubling_s is None else f"doubles in {worst.doubling_s:.3g} s"
+    rows = tuple(
+        (format_number(damping), str(np.count_nonzero(stable)), str(stable.size))
+        for damping, stable in zip(stability.damping, stability.stable, strict=True)
+    )
     return Section(
         title="Coupled stability at link 2",
         aside=f"{called.inertias} of {format_band((stability.mass[0], stability.mass[-1]), called.inertia)} on springs "
@@ -75,16 +79,7 @@ def _describe_environments(stability: StabilityMap) -> Section:
             f"{called.stiffness} with a damper of {worst.d_e:.4g} {called.damping}, whose oscillation at "
             f"{worst.frequency_hz:.4g} Hz {growth}.",
         ),
-        tables=(
-            Table(
-                head=(f"damper {called.damping}", "stable", "of"),
-                rows=tuple(
-                    (format_number(damping), str(np.count_nonzero(stable)), str(stable.size))
-                    for damping, stable in zip(stability.damping, stability.stable, strict=True)
-                ),
-                align=">>>",
-            ),
-        ),
+        tables=(Table(head=(f"damper {called.damping}", "stable", "of"), rows=rows, align=">>>"),),
     )
 
 

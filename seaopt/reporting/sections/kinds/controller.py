@@ -95,7 +95,7 @@ def describe(controller: Controller) -> list[Section]:
         f"{command.mechanics.word.capitalize()} of the motor F_m = C_r F_ref − C_y {spec.regulated}; {command.input} = "
         f"{command.per_effort:.6g} {command.per_effort_unit} × F_m."
     )
-    active = join_labels(controller.active_constraints) or "none"
+    active, head = join_labels(controller.active_constraints) or "none", (controller.judged_on, "achieved", "asked")
     return [
         Section(
             title="Controller",
@@ -107,11 +107,7 @@ def describe(controller: Controller) -> list[Section]:
         Section(
             title="Asked and achieved",
             part="controller",
-            tables=(
-                Table(
-                    head=(controller.judged_on, "achieved", "asked"), rows=tuple(list_achieved(controller)), align="<><"
-                ),
-            ),
+            tables=(Table(head=head, rows=tuple(list_achieved(controller)), align="<><"),),
             remarks=(
                 f"Active limits: {active}." if controller.met else f"{controller.explanation}.",
                 *_describe_friction(controller),

@@ -69,11 +69,7 @@ def describe(fit: Fit) -> list[Section]:
             sentences=tuple(_list_caveats(fit)),
             tables=(_tabulate_parameters(fit),),
         ),
-        *(
-            [Section(title="Fit of every output", part="fit", tables=(_tabulate_outputs(fit),), remarks=(EXPLAINED,))]
-            if fit.outputs
-            else []
-        ),
+        *_describe_outputs(fit),
         *_describe_logs(fit),
         *list_notes("the fit", fit.notes, _list_findings(fit)),
         *_describe_details(fit),
@@ -157,17 +153,13 @@ def _describe_logs(fit: Fit) -> Iterator[Section]:
         for name, log in fit.logs.items()
         if parameter in log.values
     )
+    head = ("parameter", "by all", "log", "by it alone", "std")
     yield Section(
         title="Values by each log alone",
         part="parameters",
         tables=(
             Table(label="Logs that were compared", head=("log", "amplitude", "over noise"), rows=logs, align="<>>"),
-            Table(
-                label="Values by each log alone",
-                head=("parameter", "by all", "log", "by it alone", "std"),
-                rows=rows,
-                align="<><>>",
-            ),
+            Table(label="Values by each log alone", head=head, rows=rows, align="<><>>"),
         ),
         remarks=("amplitude: standard deviation of the spring's force or torque, in the output's unit",),
     )
@@ -184,7 +176,7 @@ def _tabulate_figure(name: str, figure: DerivedFigure, remark: str) -> tuple[str
     return (name, f"{figure.value:.6g}", *stds, interval, known, _unit(figure.unit), remark, "")
 
 
-def _tabulate_outputs(fit: Fit) -> Table:
+def _describe_outputs(fit: Fit) -> Iterator[Section]:
     rows = [
         (
             f"{name}.{output}",
@@ -205,27 +197,21 @@ def _tabulate_outputs(fit: Fit) -> Table:
         for output, figures in row.items()
     ]
     columns = ("fit %", "held out", "one step", "in the band", "explained", "of at most", "residual", "", "over noise")
-    return Table(
-        label="Fit of every output",
-        head=("output", *columns, "sigma", "offset", "whiteness p"),
-        rows=tuple(rows),
-        align="<>>>>>>><>>>>",
-        optional=("sigma", "offset", "whiteness p"),
-    )
+    more = ("sigma", "offset", "whiteness p")
+    head = ("output", *columns, *more)
+    table = Table(label="Fit of every output", head=head, rows=tuple(rows), align="<>>>>>>><>>>>", optional=more)
+    if rows:
+        yield Section(title="Fit of every output", part="fit", tables=(table,), remarks=(EXPLAINED,))
 
 
 def _list_findings(fit: Fit) -> Iterator[Item]:
     """Yield what whoever uses the fit should know; errors stand in the verdict."""
     for finding in fit.findings:
         if finding.severity != "error":
-            yield Item(
-                severity=finding.severity, text=f"{finding.where}: {finding.text}" if finding.where else finding.text
-            )
+            yield Item(severity=finding.severity, text=": ".join(filter(None, (finding.where, finding.text))))
     for name, nuisance in fit.nuisance.items():
-        if len(nuisance.initial_state) > 1:
-            yield Item(
-                severity="note", text=f"{name}: {len(nuisance.initial_state)} segments, each with its initial state"
-            )
+        if (count := len(nuisance.initial_state)) > 1:
+            yield Item(severity="note", text=f"{name}: {count} segments, each with its initial state")
 
 
 def _describe_details(fit: Fit) -> Iterator[Section]:
@@ -235,16 +221,10 @@ def _describe_details(fit: Fit) -> Iterator[Section]:
             (parameter.name, f"{parameter.value:.6g}", _unit(parameter.unit), parameter.description)
             for parameter in fixed
         )
-        yield Section(
-            title=f"{format_count(len(fixed), 'parameter')} not fitted",
-            part="parameters",
-            folded=True,
-            tables=(
-                Table(
-                    label="Fixed parameters", head=("parameter", "value", "unit", "meaning"), rows=rows, align="<><<"
-                ),
-            ),
-        )
+        head = ("parameter", "value", "unit", "meaning")
+        table = Table(label="Fixed parameters", head=head, rows=rows, align="<><<")
+        title = f"{format_count(len(fixed), 'parameter')} not fitted"
+        yield Section(title=title, part="parameters", folded=True, tables=(table,))
 
 
 def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:

@@ -38,6 +38,8 @@ def describe(mpc: ForceMPC) -> list[Section]:
         )
         for verdict in mpc.verdicts
     )
+    head = ("plant", "limit", "achieved", "asked", "unit", "")
+    table = Table(label="Limits of predictive control", head=head, rows=rows, align="<<>><<")
     return [
         Section(
             title="Predictive control",
@@ -48,14 +50,7 @@ def describe(mpc: ForceMPC) -> list[Section]:
                 f"; horizon {1e3 * spec.horizon_s:g} ms, {mpc.prediction.knots.size} moves.",
                 *bounds,
             ),
-            tables=(
-                Table(
-                    label="Limits of predictive control",
-                    head=("plant", "limit", "achieved", "asked", "unit", ""),
-                    rows=rows,
-                    align="<<>><<",
-                ),
-            ),
+            tables=(table,),
             remarks=(
                 f"The figures hold while no limit of the {mpc.actuation.word} is active.",
                 f"Bandwidth {format_number(mpc.achieved.bandwidth_hz, missing='none')} Hz, asked "

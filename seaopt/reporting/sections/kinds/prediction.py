@@ -86,20 +86,10 @@ def _describe_comparison(comparison: LogComparison) -> list[Section]:
         )
         for name, (value, std) in comparison.log.values.items()
     )
-    return [
-        Section(
-            title=f"Values by {comparison.name} alone",
-            aside=f"{format_number(comparison.log.excess, 2)} times its sensor's noise left",
-            tables=(
-                Table(
-                    label="Values by the fit and by this log alone",
-                    head=("parameter", "fit", "std", "this log", "std", "std apart"),
-                    rows=rows,
-                    align="<>>>>>",
-                ),
-            ),
-        )
-    ]
+    head = ("parameter", "fit", "std", "this log", "std", "std apart")
+    table = Table(label="Values by the fit and by this log alone", head=head, rows=rows, align="<>>>>>")
+    left = f"{format_number(comparison.log.excess, 2)} times its sensor's noise left"
+    return [Section(title=f"Values by {comparison.name} alone", aside=left, tables=(table,))]
 
 
 def _advise(comparison: LogComparison) -> str:

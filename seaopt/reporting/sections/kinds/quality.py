@@ -15,6 +15,8 @@ def describe(quality: Quality) -> list[Section]:
     """Return the findings, and the figures of every channel; faults that no channel has are left out."""
     clock = quality.clock
     size = f"{clock.samples} samples, {quality.duration_s:.6g} s at {clock.rate_hz:.6g} Hz, {describe_jitter(clock)}."
+    rows = tuple(map(_format_channel, quality.channels.values()))
+    table = Table(head=HEAD, rows=rows, align="<<".ljust(len(HEAD), ">"))
     return [
         Section(
             title=f"{quality.source}: {_count_faults(quality)}",
@@ -25,18 +27,7 @@ def describe(quality: Quality) -> list[Section]:
                 for finding in quality.findings
             ),
         ),
-        Section(
-            title="Channels",
-            part="logs",
-            tables=(
-                Table(
-                    head=HEAD,
-                    rows=tuple(map(_format_channel, quality.channels.values())),
-                    align="<<".ljust(len(HEAD), ">"),
-                ),
-            ),
-            remarks=quality.notes,
-        ),
+        Section(title="Channels", part="logs", tables=(table,), remarks=quality.notes),
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -26,24 +27,11 @@ def describe(responses: Responses) -> list[Section]:
     """Return a section per experiment, and details of the second-order forms."""
     sections: list[Section] = []
     for name, survey in responses.surveys.items():
-        sections.append(
-            Section(
-                title=name,
-                tables=(
-                    Table(
-                        head=HEAD,
-                        rows=tuple(_format_pair(responses, name, survey, pair) for pair in survey.pairs),
-                        align="<<".ljust(len(HEAD), ">"),
-                    ),
-                ),
-                remarks=tuple(
-                    line
-                    for pair in survey.pairs
-                    if (drive := survey.drive(pair, responses.guess)) is not None
-                    for line in _describe_drive(survey, pair, drive)
-                ),
-            )
-        )
+        rows = tuple(_format_pair(responses, name, survey, pair) for pair in survey.pairs)
+        table = Table(head=HEAD, rows=rows, align="<<".ljust(len(HEAD), ">"))
+        drives = ((pair, survey.drive(pair, responses.guess)) for pair in survey.pairs)
+        lines = (_describe_drive(survey, pair, drive) for pair, drive in drives if drive is not None)
+        sections.append(Section(title=name, tables=(table,), remarks=tuple(chain.from_iterable(lines))))
     forms = tuple(line.strip() for form in responses.list_forms() for line in repr(form).splitlines())
     return [
         *sections,
