@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
-from seaopt.estimation.judgement.ripple_search import find_ripple
+from seaopt.estimation.judgement.ripple_search import find_ripple, read_position
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.fit_result import Fit
@@ -265,8 +265,11 @@ def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment)
     ripple: Mapping[str, float] = {}
     position, left = plant.sensing and plant.sensing.motor_position, residuals[experiment.name]
     if position and position in plant.states and len(left.segments) == len(experiment.log.segments):
-        posed = next(e for e in fit.require_minimum("_measure").problem.experiments if e.name == experiment.name)
-        ripple = find_ripple(posed, left, fit.parameters, run[position], number)
+        minimum = fit.require_minimum("_measure")
+        posed = next(e for e in minimum.problem.experiments if e.name == experiment.name)
+        measured = read_position(posed, minimum.z)
+        place = run[position] if measured is None else measured[longest]
+        ripple = find_ripple(posed, left, fit.parameters, place, number)
     dry = 0.0 if friction is None or friction.jump is None else friction.jump(0.0, friction.add_rated(values))
     return Sizes(
         current=_find_largest(current),

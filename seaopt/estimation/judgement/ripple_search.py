@@ -1,11 +1,13 @@
 r"""At which wave number of the motor's position a residual repeats: where a refit with cogging starts.
 
 A force :math:`a \sin(n q) + b \cos(n q)` on the motor moves an output by what the plant makes of it, G. With the motion
-q that the fit has, and G of the plant as it slides, residuals are regressed on :math:`G \sin(n q)` and :math:`G \cos(n
-q)` for each n, all in the frequency domain: products of spectra are those of signals. Where the motor passes a quarter
-of a period in a sample the force comes and goes faster than the log shows, and counts as none. The n that accounts for
-most of the power of some output is where the refit starts; from others it would not get there, as minima lie one beside
-the other.
+q that was measured, or else that the fit has, and G of the plant as it slides, residuals are regressed on
+:math:`G \sin(n q)` and :math:`G \cos(n q)`, all in the frequency domain: products of spectra are those of signals.
+There residuals are divided by what they have nearby, for what drifts slowly is alike for every n. Where the motor
+passes a quarter of a period in a sample the force comes and goes faster than the log shows, and counts as none. The n
+that accounts for most of the power of some output is where the refit starts; from others it would not get there, as
+minima lie one beside the other. Which n are worth a regression is looked up first: what residuals have of a force is
+summed up place by place of the motor, and the spectrum of that has all n at once.
 """
 
 from __future__ import annotations
@@ -18,14 +20,18 @@ from jaxtyping import Complex, Float
 from seaopt.estimation.problem.correlation import load_fft
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import friction_matrices, remove_friction
 from seaopt.plants.plant import Plant, state_space
 
-MOST = 1200  # wave numbers that are tried
-LONGEST = 10_000  # samples, where the motor travels most: each wave number costs two spectra of them
+MOST = 4000  # wave numbers, one for each half period over the travel
+LONGEST = 10_000  # samples, where the motor travels most: each wave number that is tried costs two spectra of them
+TRIED = 8  # of each octave
+PLACES = 8  # per period of the largest wave number, that what residuals have of a force is summed up in
 FINE = 8  # steps on either side of the best
-LEAST = 0.1  # of a residual's power that a ripple has to account for
+NEARBY = 31  # lines of a spectrum over which its power is its own
+LEAST, OF_CHANCE = 0.01, 40.0  # of a whitened residual that a ripple has to account for, and times a sample's share
 TURNS = 0.25  # of a period, the most that the motor moves in a sample
 SLOW = 0.2  # of the samples that have to be as slow as that
 
@@ -41,7 +47,7 @@ def find_ripple(
 ) -> Mapping[str, float]:
     """Return amplitudes and wave number of the cogging that residuals show best; empty where they show none.
 
-    `position`: of the motor as the fit has it, over segment `number`.
+    `position`: of the motor, over segment `number`.
     """
     looked = _find_travel(position)
     position, raw = position[looked], left.segments[number].raw.T[:, looked]
@@ -54,7 +60,9 @@ def find_ripple(
     top = min(2.0 * np.pi * TURNS / max(float(np.quantile(moved, SLOW)), 1e-300), MOST * step)
     residual = load_fft().rfft(raw / size[:, None])
     gain = _respond(experiment.data.plant, params, experiment.data.outputs, experiment.period, position.size)
-    gain = gain / size[:, None]
+    own = np.stack([np.convolve(row, np.full(NEARBY, 1.0 / NEARBY), "same") for row in np.abs(residual) ** 2])
+    own = np.sqrt(np.maximum(own, 1e-300))
+    residual, gain = residual / own, gain / size[:, None] / own
 
     def weigh(wave: float) -> tuple[float, float, float]:
         """Return the share of an output's power that a wave number accounts for, and both amplitudes."""
@@ -68,12 +76,45 @@ def find_ripple(
         share = 1.0 - np.sum(np.abs(rest) ** 2, axis=1) / np.sum(np.abs(residual) ** 2, axis=1)
         return float(np.max(share)), float(amplitudes[0]), float(amplitudes[1])
 
-    best = max(np.arange(2.0 * step, top, step), key=lambda wave: weigh(wave)[0], default=0.0)
+    force = load_fft().irfft(np.sum(np.conj(gain) * residual, axis=0), position.size)
+    best = max(_list_waves(position, force, moved, step, top), key=lambda wave: weigh(wave)[0], default=0.0)
     if not best:
         return {}
     best = max(best + step * np.linspace(-1.0, 1.0, 2 * FINE + 1), key=lambda wave: weigh(wave)[0])
     share, a, b = weigh(best)
-    return {"a_g": a, "b_g": b, "n_g": float(best)} if share > LEAST else {}
+    return {"a_g": a, "b_g": b, "n_g": float(best)} if share > max(LEAST, OF_CHANCE / position.size) else {}
+
+
+def read_position(experiment: FitExperiment, z: Vector) -> Float[np.ndarray, " samples"] | None:
+    """Return the motor's position as a log has it, without the sensor's gain and offset; None where it has none."""
+    data, point = experiment.data, experiment.point(z)
+    name = data.plant.sensing.motor_position if data.plant.sensing else None
+    if name not in data.outputs:
+        return None
+    i, there = data.outputs.index(name), np.isfinite(data.log[name])
+    measured = (data.log[name][there] - point.offset[i]) / point.gain[i]
+    return np.interp(data.log.time, data.log.time[there], measured)
+
+
+def _list_waves(
+    position: Float[np.ndarray, " n"],
+    force: Float[np.ndarray, " n"],
+    moved: Float[np.ndarray, " n"],
+    step: float,
+    top: float,
+) -> list[float]:
+    """Return the wave numbers at which a force repeats most over the positions, some of each octave up to the top."""
+    grid = 2.0 * np.pi / (PLACES * top)
+    place = ((position - position.min()) / grid).astype(int)
+    size = load_fft().next_fast_len(int(np.ceil(2.0 * np.pi / (step * grid))), real=True)
+    waves, chosen, high = 2.0 * np.pi / (size * grid) * np.arange(size // 2 + 1), list[float](), top
+    while high > 2.0 * step:
+        slow = moved * high < 2.0 * np.pi * TURNS
+        power = np.abs(load_fft().rfft(np.bincount(place, force * slow, size)))
+        there = np.flatnonzero((waves > max(0.5 * high, 2.0 * step)) & (waves <= high))
+        chosen += waves[there[np.argsort(power[there])[-TRIED:]]].tolist()
+        high *= 0.5
+    return chosen
 
 
 def _find_travel(position: Float[np.ndarray, " n"]) -> slice:

@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.estimation.judgement.ripple_search import find_ripple, read_position
+from seaopt.estimation.problem.fit_problem import pose_problem
+from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
 from tests.actuator_logs import drive, integrate
 
 RATE_HZ = 400.0
@@ -148,3 +152,30 @@ def test_firmware_that_samples_is_named_as_late_by_half_a_period():
     result = fit(record(late=16), parts=("position_servo",))
     check(result, "servo_delay")
     assert result.hypotheses[0].frees["T_v"] == pytest.approx(0.002, rel=0.15)
+
+
+def test_a_wave_number_is_found_where_the_model_has_the_motor_elsewhere():
+    """A pendulum whose joint hardly comes back: the model wanders by periods, and the measured motor has the force."""
+    p, (a, wave), n = TRUTH, (0.008, 30.0), 4000
+    _, chirp = drive(n / RATE_HZ, RATE_HZ, 0.6, seed=1, top_hz=5.0)
+
+    def rates(x, ampere):
+        angle, speed, link, turn = x
+        torque = p["k_s"] * (angle / p["N"] - link)
+        rub = p["f_c"] * math.tanh(speed / 0.5) + p["b_r"] * speed + a * math.sin(wave * angle)
+        push = p["K_tau"] * ampere - rub - torque / p["N"]
+        return speed, push / p["J_m"], turn, (torque - 0.3 * turn - 4.9 * math.sin(link)) / 0.25
+
+    angle, _, link, _ = integrate(rates, 4, chirp, 1.0 / RATE_HZ, 10)
+    noise = np.random.default_rng(2)
+    readings = {"theta_m": angle + noise.normal(scale=3e-4, size=n), "theta_l": link + noise.normal(scale=3e-5, size=n)}
+    log = so.Log.from_arrays(time=np.arange(n) / RATE_HZ, I=chirp, **readings)
+    plant = so.plants.rotary(link="pendulum")
+    given = TRUTH | {"v_s": 0.5, "J_l": 0.25, "d_l": 0.3, "m": 2.5, "L": 0.2}
+    experiment = so.Experiment(plant=plant, log=log, initial_state="rest", offset=False)
+    params = plant.defaults.update(**given).free("J_m", "f_c")
+    (posed,) = pose_problem((experiment,), params, loss=Squares()).with_each(substeps=10).experiments
+    z = np.array([given["J_m"], given["f_c"]])
+    left, position = compute_experiment_residuals(posed, z), read_position(posed, z)
+    assert wave * np.std(left.raw[:, 0]) > 3.0
+    assert find_ripple(posed, left, params, position, 0)["n_g"] == pytest.approx(wave, rel=1e-3)
