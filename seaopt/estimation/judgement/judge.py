@@ -79,7 +79,8 @@ def judge(
 
     `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
     not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's;
-    `evaluations`: what the fit took, of which the search for causes may take five times as many.
+    `evaluations`: what the fit took, of which the search for causes may take five times as many, and five times
+    `EVALUATIONS` where it took fewer: each of the hypotheses takes several, however soon the fit was there.
     """
     minimum = fit.require_minimum("judge")
     testing, trying = divide(progress, TESTS, CAUSES)
