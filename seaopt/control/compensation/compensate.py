@@ -37,7 +37,7 @@ def add_compensation(
     """Return a controller that also compensates its design plant's friction, its ripple, and the weight of a link.
 
     The law, its figures and its friction margin stay what they are; what is added acts between the law and the limit
-    of the command, in every simulation and in exported code.
+    of the command, in every simulation and in exported code, and is fed back in the figures of a certificate.
 
     Parameters
     ----------

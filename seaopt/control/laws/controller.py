@@ -107,8 +107,8 @@ class Controller(LoopDelays, Result, Worded):
     reads : tuple of str
         The outputs that the law reads, one for each of its columns; those of the specification where it is empty.
     compensation : Compensation or None
-        What is added to its effort for the plant's friction (`seaopt.control.add_compensation`). The figures and the
-        friction margin are those of the law without it.
+        What is added to its effort and its reference (`seaopt.control.add_compensation`). The figures and the friction
+        margin are those of the law without it; a certificate has those of the loop with it.
     gate : PlausibilityGate or None
         Which readings the exported law believes.
     derate : bool

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from seaopt.codec import OrInfinite
 from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
+from seaopt.control.running.fed_back import close_terms
 from seaopt.errors import ControlError
 from seaopt.options import check_options, option
 from seaopt.plants import Plant
@@ -170,6 +171,7 @@ def bracket(
     end = time.perf_counter() + budget.seconds
     peaks = np.zeros(2) if worst is None else np.array([worst.ms, worst.mt])
     try:
+        controller = close_terms(controller, plant)
         search = _start(controller, plant, unknown, budget.tolerance, peaks, 0.0 if worst is None else worst.severity)
         while search.arcs.box.size and search.count < budget.boxes and time.perf_counter() < end:
             if not np.all(np.isfinite(search.lower)) or (search.count and not search.within.size):

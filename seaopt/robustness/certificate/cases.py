@@ -19,6 +19,7 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.laws.delay import Drive, find_drive, find_given_drive_delay, split_delayed
 from seaopt.control.loops.sampled_plant import DELAYS, DRIVE_DELAY
+from seaopt.control.running.fed_back import split_states
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
 from seaopt.executors import Shared
@@ -26,7 +27,7 @@ from seaopt.frequency import MeasuredResponse
 from seaopt.options import check_options, option
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import name_states, split_friction
+from seaopt.plants.friction import name_states
 from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
 from seaopt.progress import Progress, divide
 from seaopt.records import record
@@ -70,7 +71,8 @@ class Cases:
     controller: Controller
     models: Mapping[str, Plant]  # as they are, with their friction
     unknown: Uncertainty
-    plants: Mapping[str, Plant]  # those whose loops are measured: one with friction is there sliding and stuck
+    # Those whose loops are measured, with what terms feed back of them: one with friction is there sliding and stuck.
+    plants: Mapping[str, Plant]
     bounds: Budget | None = None  # the work to spend on bounds of each worst case; none without
 
     @property
@@ -184,7 +186,7 @@ def pose_cases(
     ranges = _add_warm_winding(ranges, models, parameters, others)
     unknown = combine_uncertainty(parameters, others, ranges, models, find_own_drive(controller, parameters))
     _check_delay(controller, unknown.ranges)
-    plants = split_friction(models, unknown.nominal, [row.name for row in unknown.varied()])
+    plants = split_states(controller, models, unknown.nominal, [row.name for row in unknown.varied()])
     return Cases(controller=controller, models=models, plants=plants, unknown=unknown, bounds=bounds)
 
 

@@ -18,12 +18,13 @@ from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.law import describe_integrators
+from seaopt.control.running.fed_back import split_states
 from seaopt.errors import ControlError
 from seaopt.estimation import warn_unidentified
 from seaopt.files import seal
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import friction_slopes, remembers, split_friction
+from seaopt.plants.friction import friction_slopes, remembers
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.bounds.bracket import Bracket
@@ -155,7 +156,7 @@ class Certificate(Result, Worded):
     @property
     def linear_models(self) -> dict[str, Plant]:
         """The plants whose loops are measured: one with friction is there sliding and stuck."""
-        return split_friction(self.models, self.parameters, [varied.name for varied in self.varied])
+        return split_states(self.controller, self.models, self.parameters, [varied.name for varied in self.varied])
 
     @property
     def simulated_models(self) -> Plants:

@@ -18,6 +18,7 @@ from seaopt.control.loops.measured.figures import measure_discs
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY
+from seaopt.control.running.fed_back import close_terms
 from seaopt.estimation import Experiment, Fit
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
@@ -56,7 +57,9 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
         *(nominal[name] for name in nominal if name in {*design.parameters, DRIVE_DELAY})
     )
     varied = [row.name for row in cases.unknown.varied()]
-    figures = {name: controller.close(plant, nominal).figures() for name, plant in cases.plants.items()}
+    figures = {
+        name: close_terms(controller, plant).close(plant, nominal).figures() for name, plant in cases.plants.items()
+    }
     of_model = survey.point and not controller.designs_on_response  # else of the response
     stated = cases.plants if survey.point else {}  # of margins nothing is required, and some take long
     amplitudes = _remark_amplitude(cases, design) if survey.point else ()

@@ -26,6 +26,7 @@ import numpy as np
 
 from seaopt.codec import to_content
 from seaopt.control import ScheduledController
+from seaopt.control.running.fed_back import close_terms, split_states
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
@@ -34,7 +35,6 @@ from seaopt.files import seal
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress, count_off
 from seaopt.records import Result, Worded, record
 from seaopt.robustness.bounds.bracket import Budget
@@ -51,6 +51,7 @@ from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps
 from seaopt.units import unit_after
 
 MOTION_RATE = "min_motion_rate"
+FED_BACK = "what its terms feed back changes with it, too"
 BOUND, SWEEP = 0.2, 5.0  # seconds that a stretch, and the sweeps of a plant, take as a rule
 
 
@@ -319,7 +320,10 @@ def _bound_plants(
     (schedule, models), (low, high) = shared.value, stretch
     middle = replace(schedule.controllers[0], law=schedule.table.law(0.5 * (low + high)))
     out: list[StretchBound] = []
-    for name, plant in split_friction(models, nominal).items():
+    for name, plant in split_states(middle, models, nominal).items():
+        if close_terms(middle, plant) is not middle:
+            out.append(StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=FED_BACK))
+            continue
         values = place_variable(plant, nominal, schedule.over, 0.5 * (low + high))
         out.append(bound_stretch(name, middle, schedule.table, plant, values, low, high))
     return out

@@ -13,11 +13,11 @@ from seaopt.bench import Sensors
 from seaopt.codec import from_content, join_schemas
 from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
+from seaopt.control.running.fed_back import close_terms, split_states
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_schema, check_seal, plain
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import split_friction
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.bounds.stretch import StretchBound
@@ -171,7 +171,7 @@ def build_certificate(
     if controller.design is not None:  # certified too where nobody listed it
         models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
     varied, names = stored.varied, [row.name for row in stored.varied]
-    states = {name: split_friction({name: plant}, parameters, names) for name, plant in models.items()}
+    states = {name: split_states(controller, {name: plant}, parameters, names) for name, plant in models.items()}
     models = {name: plant for name, plant in models.items() if any(state in stored.plants for state in states[name])}
     plants = {state: plant for name in models for state, plant in states[name].items()}
     for name in stored.plants:
@@ -184,7 +184,10 @@ def build_certificate(
         certificate = Certificate(
             requirements=read_requirements(content),
             place=place,
-            plants={name: controller.close(plant, parameters).figures() for name, plant in linear.items()},
+            plants={
+                name: close_terms(controller, plant).close(plant, parameters).figures()
+                for name, plant in linear.items()
+            },
             margins={
                 name: plant_margins(controller, plant, parameters)
                 for name, plant in linear.items()

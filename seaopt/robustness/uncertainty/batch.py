@@ -21,6 +21,7 @@ from seaopt.control import Controller
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.response import LARGEST_ENTRY
 from seaopt.control.loops.sampled_plant import LinearPlants, conditions, find_delay, hold, linearise, read_conditions
+from seaopt.control.running.fed_back import close_terms
 from seaopt.control.systems.block import COMMAND, connect, make_plant
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -66,7 +67,7 @@ def batch_figures(
     peaks: bool = True,
     by: Levels | None = None,
 ) -> BatchFigures:
-    """Close `controller` around `plant` at every draw.
+    """Close `controller`, with what its terms feed back, around `plant` at every draw.
 
     Parameters
     ----------
@@ -85,6 +86,7 @@ def batch_figures(
     by : array, shape (n, 2), optional
         Levels of Ms and Mt that draws are ranked by: a peak whose level is infinite is only that of its grid.
     """
+    controller = close_terms(controller, plant)
     values, extra = expand_draws(plant, controller.delay(nominal), draws)
     count = values.shape[1]
     columns = np.vstack([values, *extra.values()])

@@ -6,6 +6,7 @@ from typing import Any
 
 from seaopt.control import Controller
 from seaopt.control.loops.margins import Margins, margins, nu_gap
+from seaopt.control.running.fed_back import close_terms
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -60,13 +61,13 @@ class PlantMargins:
 
 
 def plant_margins(controller: Controller, plant: Plant, params: ParameterSet) -> PlantMargins:
-    """Measure the margins of a controller on a plant; the controller knows its design plant."""
-    loop = controller.close(plant, params)
-    classical = margins(loop)
+    """Measure the margins of a controller on a plant, with what its terms feed back; it knows its design plant."""
+    loop, whole = controller.close(plant, params), close_terms(controller, plant)
+    classical = margins(whole.close(plant, params))
     assert controller.design is not None
     design, values = controller.design
     gap, gap_hz = nu_gap(controller.close(design, values), loop)
     period = controller.sample_time_s
     reach = min(SEARCHED_DELAYS * ((classical.delay_s or 0.0) + 2 * period), LONGEST_DELAY * period)
-    exact = sampled_delay_margin(controller, plant, params, reach) if classical.disks else 0.0
+    exact = sampled_delay_margin(whole, plant, params, reach) if classical.disks else 0.0
     return PlantMargins(margins=classical, sampled_delay_s=exact, searched_delay_s=reach, nu_gap=gap, nu_gap_hz=gap_hz)

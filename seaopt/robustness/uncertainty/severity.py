@@ -21,6 +21,7 @@ from seaopt.control import Controller
 from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.control.loops.loop import STABLE
 from seaopt.control.loops.sampled_plant import DELAYS, differentiate_linearisation, find_delay, hold
+from seaopt.control.running.fed_back import close_terms
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.uncertainty.batch import (
@@ -89,6 +90,7 @@ def severity_slopes(
     or of `by`, as in `severities`; of Ms without a limit. They are zero where there is no derivative: at a plant that
     is not finite, at a double pole.
     """
+    controller = close_terms(controller, plant)
     sampled, out = _sample_plants(controller, plant, unknown, points), np.zeros(points.shape)
     finite = np.flatnonzero(np.all(np.isfinite(sampled.a), axis=(1, 2)) & np.all(np.isfinite(sampled.b), axis=1))
     if not finite.size:

@@ -97,7 +97,7 @@ def test_certificate_requires_it(plain):
         compensate(plain, 1.0), {"knee": KNEE}, VALUES, ranges={"m": (3.7, 4.3)}, samples=5, simulations=False
     )
     (row,) = [row for row in certificate.requirements if row.name == "gravity_compensation"]
-    assert compensation.WITHOUT_TERMS in certificate.notes
+    assert compensation.WITH_TERMS in certificate.notes
     assert not row.met
     assert row.where.startswith("knee at m = 3") and row.text.endswith("at 0 rad")
 
