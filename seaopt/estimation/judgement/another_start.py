@@ -48,10 +48,13 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
     colour = measure_colour(fit.covariance, fit.white_covariance)
     gain = 0.5 * (measure_misfit(problem.evaluate(minimum.z)) - solved.misfit) / colour
     values = problem.unknowns.by_name(solved.solution.z)
-    moved = {name: (values[name], fit.parameters[name].std or 0.0) for name in _find_moved(fit, values)}
+    moved = _find_moved(fit, values)
     if not moved or gain < -ENOUGH:
         return
-    pairs = (f"{name} = {value:.4g}{unit_after(fit.parameters[name].unit)}" for name, (value, _) in moved.items())
+    # To start there takes every value: a search from two of them and the given others may end where this fit did.
+    names = fit.covariance.names if gain > ENOUGH else moved
+    preferred = {name: (values[name], fit.parameters[name].std or 0.0) for name in names}
+    pairs = (f"{name} = {value:.4g}{unit_after(fit.parameters[name].unit)}" for name, (value, _) in preferred.items())
     if gain > ENOUGH:
         text = f"another start explains the logs better, with {', '.join(pairs)}: start there"
     else:
@@ -59,7 +62,7 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
             f"another start explains the logs as well, with {', '.join(pairs)}: they do not decide; log more, or fix "
             "what is known, or give it a prior"
         )
-    yield FitFinding(severity="error", kind="starts", where=", ".join(moved), text=text, preferred=moved)
+    yield FitFinding(severity="error", kind="starts", where=", ".join(moved), text=text, preferred=preferred)
 
 
 def _find_moved(fit: Fit, values: Mapping[str, float], scale: float = 1.0) -> list[str]:

@@ -42,3 +42,20 @@ def test_the_lowest_lobe_is_not_doubted():
     fit = fit_from(1.02)
     assert abs(fit.parameters["a"].value - 1.0) < 0.01
     assert not list_starts(fit) and fit.met
+
+
+def test_to_start_elsewhere_takes_all_values():
+    """One does not move, and is stated beside the other: from the given value of it the search may go astray again."""
+    plant = so.Plant(
+        name="waves", states={"z": "-"}, inputs={"u": "-"}, outputs={"y": "-", "v": "-"},
+        parameters={"a": "-", "k": "-"}, f=lambda t, x, u, p: {"z": u.u - x.z},
+        h=lambda t, x, u, p: {"y": ca.sin(p.a * u.u) + 0 * x.z, "v": p.k * u.u},
+    )  # fmt: skip
+    rng, u = np.random.default_rng(2), np.linspace(0.0, 20.0, N)
+    outputs = {"y": np.sin(u) + 0.05 * rng.normal(size=N), "v": 3.0 * u + 0.05 * rng.normal(size=N)}
+    log = so.Log.from_arrays(time=np.arange(N) * 1e-2, u=u, **outputs)
+    bench = so.Experiment(plant=plant, log=log, initial_state="rest", offset=False, name="log")
+    params = so.ParameterSet.of(a=(1.45, "-"), k=(1.0, "-")).free("a", "k")
+    fit = so.fit([bench], params, method=so.OutputError(search=False))
+    (finding,) = list_starts(fit)
+    assert finding.where == "a" and abs(finding.preferred["k"][0] - 3.0) < 0.01
