@@ -15,7 +15,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.signal import lfilter
 
 from seaopt.codec import Constraints
 from seaopt.control.systems.block import Block
@@ -164,6 +163,8 @@ class OuterLoop:
 
     def run(self, references: Any, positions: Any) -> Float[np.ndarray, "... n"]:
         """Return the force law's references over samples, from rest at the first position."""
+        from scipy.signal import lfilter  # deferred: scipy.signal brings scipy.stats, which takes half a second
+
         speed = np.asarray(lfilter([self.rate, -self.rate], [1.0, -self.pole], positions - positions[..., :1]))
         return self.direction * (self.stiffness * (references - positions) - self.damping * speed)
 

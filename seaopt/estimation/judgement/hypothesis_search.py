@@ -21,8 +21,8 @@ from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Change, Hypothesis, change_plants, measure_sizes
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
-from seaopt.estimation.problem.noise_floor import measure_floor
-from seaopt.estimation.problem.residual_statistics import compute_residuals
+from seaopt.estimation.problem.noise_floor import NoiseFloor, measure_floors
+from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
@@ -125,14 +125,22 @@ class Search:
         return replace(self, trials=tuple(rows))
 
 
-def search_hypotheses(fit: Fit, budget: int, progress: Progress = ignore, *, doubtful: bool = False) -> Search:
+def search_hypotheses(
+    fit: Fit,
+    residuals: ResidualsByExperiment,
+    floors: Mapping[str, NoiseFloor],
+    budget: int,
+    progress: Progress = ignore,
+    *,
+    doubtful: bool = False,
+) -> Search:
     """Return the hypotheses that were tried, the best first; none where the residual asks for none.
 
-    `fit`: with its minimum; `budget`: evaluations that the search may take; `doubtful`: whether values hang on little
-    of the residual, so that what is hardly more than noise asks, too.
+    `fit`: with its minimum, `residuals`, `floors`: there; `budget`: evaluations that the search may take; `doubtful`:
+    whether values hang on little of the residual, so that what is hardly more than noise asks, too.
     """
     minimum = fit.require_minimum("search_hypotheses")
-    first = _measure_excess(minimum.problem, minimum.z)
+    first = _find_excess(minimum.problem, residuals, floors)
     if (first <= ASKS and not doubtful) or minimum.problem.predicts:
         return Search()
     end = count_evaluations() + budget
@@ -326,13 +334,20 @@ def _rest(problem: FitProblem, start: Evaluation, old: FitProblem) -> FitProblem
 
 @np.errstate(all="ignore")  # a run that overflows, where it is held out alone, has no finite excess
 def _measure_excess(problem: FitProblem, z: Vector) -> float:
+    """Return how many times its noise a residual at `z` is, where it is most."""
+    residuals = compute_residuals(problem, z)
+    return _find_excess(problem, residuals, measure_floors(problem, residuals))
+
+
+@np.errstate(all="ignore")
+def _find_excess(problem: FitProblem, residuals: ResidualsByExperiment, floors: Mapping[str, NoiseFloor]) -> float:
     """Return how many times its noise a residual is, where it is most: of the samples used and of those held out.
 
     Infinite where the model runs away.
     """
-    residuals, ratios = compute_residuals(problem, z), [0.0]
+    ratios = [0.0]
     for experiment in problem.experiments:
-        floor = measure_floor(experiment, residuals[experiment.name])
+        floor = floors[experiment.name]
         ratios += floor.excess.tolist()
         if experiment.holdout and problem.band_hz is None:
             parts = zip(experiment.segments, residuals[experiment.name].segments, strict=True)

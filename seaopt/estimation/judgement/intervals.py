@@ -63,7 +63,6 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
         return
     plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
     smoothing = {name for plant in plants for name in list_smoothing(plant)}
-    effects = _list_effects(fit)
     for name in fit.covariance.names:
         parameter = fit.parameters[name]
         if parameter.known is None or parameter.known <= ROUGH or not parameter.identified or parameter.at_bound:
@@ -76,7 +75,7 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
         if may_be_zero and half * error.effect[error.names.index(name)] <= UNSEEN:
             continue
         yield FitFinding(
-            severity="warning" if name in effects else "error",
+            severity="warning" if name in _list_effects(fit) else "error",
             kind="rough",
             where=name,
             text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "

@@ -29,6 +29,7 @@ from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_am
 from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import count_evaluations
+from seaopt.estimation.problem.noise_floor import measure_floors
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
@@ -93,7 +94,8 @@ def judge(
     }
     fit = _score_held_out_shots(_state_shares(fit, shares), minimum.problem.holdout)
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
-    error = estimate_model_error(minimum.problem, minimum.z, residuals, noise.matrix)
+    floors = measure_floors(minimum.problem, residuals)
+    error = estimate_model_error(minimum.problem, minimum.z, residuals, floors, noise.matrix)
     excess = error.excess
     fit = compare_logs(widen(_state_excess(fit, excess), error.matrix), validation)
     fit = replace(fit, silent=find_silent(fit))
@@ -121,7 +123,11 @@ def judge(
     refitting = divide(trying, OF_HYPOTHESES, OF_CAUSES)[0]
     evaluations, begun = max(evaluations, EVALUATIONS), count_evaluations()
     doubtful = _hangs_on_little(fit, findings)
-    search = Search() if little else search_hypotheses(fit, OF_HYPOTHESES * evaluations, refitting, doubtful=doubtful)
+    search = (
+        Search()
+        if little
+        else search_hypotheses(fit, residuals, floors, OF_HYPOTHESES * evaluations, refitting, doubtful=doubtful)
+    )
     if search.partial is not None:
         fit, findings = _reach(fit, findings, error, search.partial)
     if wrong or search.able:

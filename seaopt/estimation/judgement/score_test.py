@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
-from seaopt.estimation.problem.residual_statistics import compute_statistics
+from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment, compute_statistics
 from seaopt.estimation.result.covariance import compute_bread, compute_meat
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import find_blocked
@@ -69,7 +69,8 @@ def run_score_tests(
         return {}
     units = {name: fit.parameters[name].unit for name in names} | {f"{name}.delay_s": "s" for name in data}
     places = np.array([trial.unknowns.names.index(name) for name in units])
-    score, information, variance = _compute_scores(trial, evaluation, places)
+    statistics = minimum.statistics or compute_statistics(trial, z)
+    score, information, variance = _compute_scores(trial, evaluation, places, statistics)
     chosen = np.flatnonzero((information > REDUNDANT * np.diag(evaluation.hessian)[places]) & (variance > 0.0))
     order = sorted(chosen, key=lambda i: score[i] ** 2 / information[i], reverse=True)
     rows = list(units.items())
@@ -119,7 +120,7 @@ def free_more(fit: Fit, names: tuple[str, ...]) -> ParameterSet:
 
 
 def _compute_scores(
-    trial: FitProblem, evaluation: Evaluation, places: Int[np.ndarray, " c"]
+    trial: FitProblem, evaluation: Evaluation, places: Int[np.ndarray, " c"], statistics: StatisticsByExperiment
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return scores, their information, and their variances with the residuals as coloured as they are."""
     unknowns, z = trial.unknowns, evaluation.passes.z  # whose passes are kept
@@ -134,5 +135,5 @@ def _compute_scores(
     information = np.diag(hessian)[places] - np.sum(hessian[kept][:, places] * across, axis=0)
     along = np.zeros((z.size, places.size))
     along[kept], along[places, np.arange(places.size)] = -across, 1.0
-    meat = compute_meat(trial, z, along, compute_statistics(trial, z))
+    meat = compute_meat(trial, z, along, statistics)
     return score, information, np.diag(meat + (along.T * unknowns.precision) @ along)

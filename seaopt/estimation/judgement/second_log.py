@@ -27,6 +27,7 @@ from seaopt.errors import SeaoptError
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Loss, Squares
+from seaopt.estimation.problem.noise_floor import measure_floors
 from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector
 from seaopt.estimation.result.findings import LogValues
 from seaopt.estimation.result.fit_result import Fit
@@ -233,7 +234,9 @@ def _refit(
     # What its own residual's colour and parts add belongs to how well it knows its values.
     found = refit.require_minimum("_refit")
     noise = refit.covariance if refit.delay_covariance is None else refit.delay_covariance
-    error = estimate_model_error(found.problem, found.z, found.residuals(), noise.matrix)
+    residuals = found.residuals()
+    floors = measure_floors(found.problem, residuals)
+    error = estimate_model_error(found.problem, found.z, residuals, floors, noise.matrix)
     outputs = {
         experiment.name: {
             name: replace(figures, excess=error.excess[f"{experiment.name}.{name}"])

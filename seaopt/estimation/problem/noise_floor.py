@@ -23,7 +23,11 @@ from jaxtyping import Float
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Loss
-from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
+from seaopt.estimation.problem.residual_statistics import (
+    ExperimentResiduals,
+    ResidualsByExperiment,
+    compute_residuals,
+)
 from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.records import record
@@ -53,13 +57,17 @@ class NoiseFloor:
 
 def measure_excess(problem: FitProblem, z: Vector) -> dict[str, float]:
     """Return how many times its sensor's noise each output's residual is, by EXPERIMENT.OUTPUT, at unknowns `z`."""
-    residuals = compute_residuals(problem, z)
-    return list_excess(problem, {e.name: measure_floor(e, residuals[e.name]) for e in problem.experiments})
+    return list_excess(problem, measure_floors(problem, compute_residuals(problem, z)))
 
 
 def list_excess(problem: FitProblem, floors: Mapping[str, NoiseFloor]) -> dict[str, float]:
     """Return the excess of each output, by EXPERIMENT.OUTPUT."""
     return {output.label: float(floors[output.experiment.name].excess[output.index]) for output in problem.outputs}
+
+
+def measure_floors(problem: FitProblem, residuals: ResidualsByExperiment) -> dict[str, NoiseFloor]:
+    """Return the noise and the residuals' rms of every experiment, by its name."""
+    return {e.name: measure_floor(e, residuals[e.name]) for e in problem.experiments}
 
 
 def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> NoiseFloor:

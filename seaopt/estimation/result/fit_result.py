@@ -13,7 +13,11 @@ from seaopt.codec import Key, OrInfinite, OrNaN, check_agrees, read_fields, to_c
 from seaopt.errors import EstimationError, FileError
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
-from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, compute_residuals
+from seaopt.estimation.problem.residual_statistics import (
+    ExperimentResiduals,
+    StatisticsByExperiment,
+    compute_residuals,
+)
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import (
@@ -49,6 +53,7 @@ class Minimum:
     problem: FitProblem
     z: Vector
     method: Method
+    statistics: StatisticsByExperiment | None = None  # of the residuals there, where they were asked for
 
     def residuals(self) -> dict[str, ExperimentResiduals]:
         """Return the residuals of each experiment, by a simulation of them all."""

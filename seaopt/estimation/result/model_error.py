@@ -37,7 +37,7 @@ from jaxtyping import Bool, Float
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
-from seaopt.estimation.problem.noise_floor import NoiseFloor, list_excess, measure_floor
+from seaopt.estimation.problem.noise_floor import NoiseFloor, list_excess
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
 from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal, Vector
@@ -81,16 +81,19 @@ class ModelError:
 
 
 def estimate_model_error(
-    problem: FitProblem, z: Vector, residuals: ResidualsByExperiment, noise: ParameterMatrix
+    problem: FitProblem,
+    z: Vector,
+    residuals: ResidualsByExperiment,
+    floors: Mapping[str, NoiseFloor],
+    noise: ParameterMatrix,
 ) -> ModelError:
-    """Return what the residuals at a minimum may move its parameters and delays by, besides their noise. `residuals`:
-    at `z`; `noise`: the covariance of the parameters and the fitted delays, in their order.
+    """Return what the residuals at a minimum may move its parameters and delays by, besides their noise. `residuals`,
+    `floors`: at `z`; `noise`: the covariance of the parameters and the fitted delays, in their order.
     """
     unknowns = problem.unknowns
     delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
     stated = np.array([*range(unknowns.shared), *delays], dtype=int)
     names = tuple(unknowns.names[i] for i in stated)
-    floors = {e.name: measure_floor(e, residuals[e.name]) for e in problem.experiments}
     excess = list_excess(problem, floors)
     bread = problem.evaluate(z).hessian if problem.loss.quadratic else compute_bread(problem, z)
     if not stated.size or not np.all(np.isfinite(bread)):

@@ -123,7 +123,7 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
             *_find_oddities(fitted, sizes, evaluation),
         ),
         experiments=experiments,
-        minimum=Minimum(problem=problem, z=z, method=method),
+        minimum=Minimum(problem=problem, z=z, method=method, statistics=statistics),
     )
 
 

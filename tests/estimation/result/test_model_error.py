@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 
 import seaopt as so
 from seaopt.estimation import Huber, Squares
+from seaopt.estimation.problem.noise_floor import measure_floors
 from seaopt.estimation.result.model_error import ENVELOPE_S, INDEPENDENT, PARTS, _measure_envelope, estimate_model_error
 from seaopt.estimation.result.widening import widen
 
@@ -31,7 +32,9 @@ def regress(u, w, y, **options):
     params = so.ParameterSet.of(a=(1.0, "-"), b=(1.0, "-")).free("a", "b")
     fit = so.fit([bench], params, method=so.OutputError(search=False), diagnostics=False)
     minimum = fit.minimum
-    error = estimate_model_error(minimum.problem, minimum.z, minimum.residuals(), fit.covariance.matrix)
+    residuals = minimum.residuals()
+    floors = measure_floors(minimum.problem, residuals)
+    error = estimate_model_error(minimum.problem, minimum.z, residuals, floors, fit.covariance.matrix)
     return fit, error
 
 
