@@ -15,6 +15,7 @@ from seaopt.records import record
 VectorN = Float[np.ndarray, " n"]
 VectorM = Float[np.ndarray, " m"]
 VectorK = Float[np.ndarray, " k"]
+VectorX = Float[np.ndarray, " nx"]
 RowsK = Int[np.ndarray, " k"]
 
 # What channels are called where nobody says what they are, in any case.

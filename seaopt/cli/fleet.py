@@ -97,16 +97,16 @@ def run_fleet(
 
 def _check_options(logs: Sequence[FleetLog], drift: Mapping[str, Any]) -> None:
     """Refuse options of drift before any log is fitted."""
-    import polars as pl
-
     from seaopt.fleet import Fleet, order_runs
     from seaopt.fleet.cusum import choose_threshold
     from seaopt.fleet.drift import PER_RUNS
     from seaopt.fleet.history import parse_time
+    from seaopt.fleet.table import tabulate_logs
 
     names = tuple(logs[0].identity)
-    rows = pl.DataFrame({"log": [log.path for log in logs], **{n: [log.identity[n] for log in logs] for n in names}})
-    history = order_runs(Fleet(rows=rows, units={}, identity=names), drift["actuator"], drift["time"])
+    history = order_runs(
+        Fleet(rows=tabulate_logs(logs, names), units={}, identity=names), drift["actuator"], drift["time"]
+    )
     choose_threshold(drift["false_alarms"], PER_RUNS, 1)
     if drift["since"] is not None:
         parse_time(drift["since"], history)

@@ -48,26 +48,26 @@ STEPS = 10  # to the most likely mean of Student's t
 LEARNT_DOF = 1e6  # from where on a variance is known
 
 
-def _make_chain(threshold: float, allowance: float) -> Float[np.ndarray, "m m"]:
+def _make_chain(threshold: float) -> Float[np.ndarray, "m m"]:
     """Return the transitions of a one-sided chart among its states below the threshold; what is missing is alarm."""
     width = 2.0 * threshold / (2 * STATES - 1)  # the state of zero is half as wide: it has no values below
-    steps = (np.arange(STATES)[None, :] - np.arange(STATES)[:, None]) * width + allowance
+    steps = (np.arange(STATES)[None, :] - np.arange(STATES)[:, None]) * width + ALLOWANCE
     chain = ndtr(steps + width / 2) - ndtr(steps - width / 2)
     chain[:, 0] = ndtr(steps[:, 0] + width / 2)
     return chain
 
 
-def average_run_length(threshold: float, allowance: float = ALLOWANCE) -> float:
-    """Return a one-sided chart's mean runs to a false alarm; `threshold`, `allowance`: h and k, in std."""
-    chain = _make_chain(threshold, allowance)
+def average_run_length(threshold: float) -> float:
+    """Return a one-sided chart's mean runs to a false alarm; `threshold`: h, in std."""
+    chain = _make_chain(threshold)
     return float(np.linalg.solve(np.eye(STATES) - chain, np.ones(STATES))[0])
 
 
-def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANCE) -> VectorN:
+def alarm_probabilities(threshold: float, runs: int) -> VectorN:
     """Return the probabilities that a one-sided chart raises an alarm within 0, 1, ... runs, where nothing has changed.
-    `threshold`: h, in standard deviations. `runs`: how many, at most. `allowance`: k, in standard deviations.
+    `threshold`: h, in standard deviations. `runs`: how many, at most.
     """
-    chain, left = _make_chain(threshold, allowance), np.eye(STATES)[0]
+    chain, left = _make_chain(threshold), np.eye(STATES)[0]
     within = np.zeros(runs + 1)
     for run in range(runs):
         left = left @ chain
@@ -76,10 +76,9 @@ def alarm_probabilities(threshold: float, runs: int, allowance: float = ALLOWANC
 
 
 @lru_cache(maxsize=64)
-def choose_threshold(probability: float, runs: int, charts: int, allowance: float = ALLOWANCE) -> float:
+def choose_threshold(probability: float, runs: int, charts: int) -> float:
     """Return the threshold h with which an actuator of so many `charts`, a parameter each, raises a false alarm within
-    `runs` runs with at most this probability. `allowance`: k, in standard deviations. Raises SeaoptError: the
-    probability is not between 1e-6 and 1.
+    `runs` runs with at most this probability. Raises SeaoptError: the probability is not between 1e-6 and 1.
     """
     if not 0.0 < probability < 1.0:
         raise SeaoptError(f"false_alarms = {probability:g} is no probability above 0 and below 1; give 0.01")
@@ -88,7 +87,7 @@ def choose_threshold(probability: float, runs: int, charts: int, allowance: floa
     share = probability / (2 * charts)
 
     def exceed(threshold: float) -> float:
-        return float(np.log(max(alarm_probabilities(threshold, runs, allowance)[-1], 1e-15) / share))
+        return float(np.log(max(alarm_probabilities(threshold, runs)[-1], 1e-15) / share))
 
     solver: Any = brentq
     return float(solver(exceed, 0.1, LARGEST, xtol=1e-4))
@@ -117,17 +116,16 @@ def chart_runs(
     scale: float = 1.0,
     dof: float = np.inf,
     start: int = 1,
-    allowance: float = ALLOWANCE,
 ) -> Charts:
     """Chart runs, the values of each actuator in the order of time.
 
     After an alarm the baseline stays as it was, so that it does not learn what is wrong.
 
     `values`: nan where an actuator has no run. `variances`: of each value: independent from run to run, as that of its
-    fit. `threshold`, `allowance`: h and k, in standard deviations. `between`, `correlation`: variance between runs, and
-    the correlation of that in runs that follow each other. `scale`, `dof`: of Student's t, of which innovations over
-    their stds are; 1 and infinite where they are normal. `start`: runs that a baseline starts from, without a chart of
-    them: of heavy tails several, by Student's t.
+    fit. `threshold`: h, in standard deviations. `between`, `correlation`: variance between runs, and the correlation of
+    that in runs that follow each other. `scale`, `dof`: of Student's t, of which innovations over their stds are; 1 and
+    infinite where they are normal. `start`: runs that a baseline starts from, without a chart of them: of heavy tails
+    several, by Student's t.
     """
     count, runs = values.shape
     ratios, innovations = np.full((2, count, runs), np.nan)
@@ -145,7 +143,7 @@ def chart_runs(
         ratio = (values[:, run] - mean - state) / spread
         z = np.where(charted, np.clip(_normalise(ratio, dof), -CLIP, CLIP), 0.0)
         ratios[charted, run], innovations[charted, run] = ratio[charted], z[charted]
-        now = np.where(charted, np.maximum(0.0, now + np.stack([z, -z]) - allowance), now)
+        now = np.where(charted, np.maximum(0.0, now + np.stack([z, -z]) - ALLOWANCE), now)
         sums[:, :, run] = now
         alarm[(alarm < 0) & np.any(now > threshold, axis=0)] = run
         # Kalman's gains, of the innovation as it counted

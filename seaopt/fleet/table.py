@@ -21,7 +21,7 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -161,7 +161,7 @@ class FleetTable:
         rows = self.read()
         if not names or not len(rows):
             return
-        now = pl.DataFrame({"log": [log.path for log in logs], **{n: [log.identity[n] for log in logs] for n in names}})
+        now = tabulate_logs(logs, names)
         labelled = rows.drop(names).join(now, on="log").select(rows.columns)
         before = rows.join(now.select("log"), on="log", how="semi")
         if not labelled.select("log", *names).equals(before.select("log", *names)):
@@ -305,3 +305,8 @@ def _lock(path: Path) -> int:
         os.close(handle)
         raise FileError(f"{path.parents[1]}: another fleet writes it; wait, or give another folder") from error
     return handle
+
+
+def tabulate_logs(logs: Sequence[FleetLog], names: Iterable[str]) -> pl.DataFrame:
+    """Return a row per log with these of its identity beside it."""
+    return pl.DataFrame({"log": [log.path for log in logs], **{n: [log.identity[n] for log in logs] for n in names}})

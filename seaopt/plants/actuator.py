@@ -54,6 +54,7 @@ the ground with :math:`-F_1 = -J \ddot\theta - \tau_s`, which the lumped drive m
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -269,6 +270,11 @@ def check_choices(*choices: tuple[str, object, tuple[str, ...]]) -> None:
     for what, choice, valid in choices:
         if choice not in valid:
             raise PlantError(f'{what} = "{choice}" is not known; use ' + " or ".join(f'"{name}"' for name in valid))
+
+
+def remake(make: Callable[[str, Any], Plant], name: str, build: Any, parts: tuple[Part, ...]) -> Plant:
+    """Return the plant that `make` gives with these parts."""
+    return make(name, replace(build, parts=parts))
 
 
 def make_plant(

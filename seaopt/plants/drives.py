@@ -34,7 +34,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import field, replace
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -65,6 +64,9 @@ STATED = ("k_p",)  # without a default: who has a servo knows its gain, and any 
 INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
 SUPPLY = "supply"  # the input that is the voltage on which a duty is
 
+# What a plant's input is, or all of its inputs, and beside its own {state: rate} and {output: value}.
+_Solved = tuple[Any, Mapping[str, Any], Mapping[str, Any]]
+
 
 @record(eq=False)
 class _Drive:
@@ -78,7 +80,7 @@ class _Drive:
     states: Mapping[str, str]
     outputs: Mapping[str, str]
     parameters: tuple[Parameter, ...]
-    solve: Callable[[Any, Any, Any, Any], tuple[Any, Mapping[str, Any], Mapping[str, Any]]]
+    solve: Callable[[Any, Any, Any, Any], _Solved]
     effort: Callable[[Any], Any]  # of the parameters: what one unit of the new input is of the plant's, at rest
     largest: Callable[[Any], Any] | None = None  # of the new input
     optional: Mapping[str, str] = field(default_factory=dict[str, str])  # further inputs, zero where a log has none
@@ -105,7 +107,7 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
     def find_supply(u: Any, p: Any) -> Any:
         return ca.if_else(u.supply > 0.0, u.supply, p.V_s) if "supply_input" in parts else p.V_s
 
-    def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
+    def solve(t: Any, x: Any, u: Any, p: Any) -> _Solved:
         share = 1.0 if part == "voltage_input" else ca.fmin(ca.fmax(u.duty, -1.0), 1.0)
         driving = share * (u.V if part == "voltage_input" else find_supply(u, p)) - find_emf(x, p)
         # The bridge takes share * I from the supply, and gives share of its voltage.
@@ -150,7 +152,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     integral, limited = "servo_integral" in parts, "servo_limit" in parts
     commanded = {} if source in plant.outputs else {source: plant.inputs[source]}  # a log may hold it, too
 
-    def solve(t: Any, x: Any, u: Any, p: Any) -> tuple[Any, Mapping[str, Any], Mapping[str, Any]]:
+    def solve(t: Any, x: Any, u: Any, p: Any) -> _Solved:
         reading = getattr(x, position, None)
         error = u.goal - (plant.h(t, x, with_values(u, {source: 0.0}), p)[position] if reading is None else reading)
         command = p.g_s * (p.k_p * error - (p.k_d * getattr(x, rate) if rate else 0.0))
@@ -191,7 +193,7 @@ def _put_before(plant: Plant, drive: _Drive, ports: tuple[Port, ...]) -> Plant:
         source,
     )
 
-    def solve_inside(t: Any, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, Mapping[str, Any], Mapping[str, Any]]:
+    def solve_inside(t: Any, x: Any, u: Any, p: Any) -> _Solved:
         inside, rates, outputs = drive.solve(t, x, u, p)
         return with_values(u, {source: inside}), rates, outputs
 

@@ -45,7 +45,7 @@ from seaopt.plants.roles import (
     Winding,
 )
 from seaopt.records import record
-from seaopt.signals import VectorN
+from seaopt.signals import VectorN, VectorX
 from seaopt.units import factor, unit_after
 
 Equations = Callable[[Any, Any, Any, Any], Mapping[str, Any]]
@@ -451,7 +451,7 @@ def _deflection_slope(plant: Plant) -> Any:
     return ca.Function("deflection", [plant.x, plant.p], [ca.densify(slope)])
 
 
-def deflection_row(plant: Plant, params: CompletedParameters) -> Float[np.ndarray, " nx"]:
+def deflection_row(plant: Plant, params: CompletedParameters) -> VectorX:
     """Return the spring's deflection as a row of weights of the states, at zero."""
     zero = np.zeros(len(plant.states))
     return np.array(_deflection_slope(plant)(zero, params.vector)).ravel()

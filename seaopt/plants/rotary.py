@@ -26,6 +26,7 @@ from seaopt.plants.actuator import (
     Transmission,
     check_choices,
     make_plant,
+    remake,
 )
 from seaopt.plants.friction import let_stick
 from seaopt.plants.motor import effects
@@ -253,12 +254,8 @@ def _actuator(name: str, build: _Build) -> Plant:
         second_order=("reflected_inertia", "reflected_damping"),
         inputs=("tau_e",) if build.external else (),
         ports=(_port(name, build),),
-        recipe=Recipe(parts=build.parts, make=partial(_remake, name, build)),
+        recipe=Recipe(parts=build.parts, make=partial(remake, _actuator, name, build)),
     )
-
-
-def _remake(name: str, build: _Build, parts: tuple[Part, ...]) -> Plant:
-    return _actuator(name, replace(build, parts=parts))
 
 
 def _derive_figures(p: Any, build: _Build) -> dict[str, tuple[Any, str]]:

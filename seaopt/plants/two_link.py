@@ -25,6 +25,7 @@ from seaopt.plants.actuator import (
     Transmission,
     check_choices,
     make_plant,
+    remake,
 )
 from seaopt.plants.friction import let_stick
 from seaopt.plants.parts import PARTS, Part
@@ -164,12 +165,8 @@ def _actuator(name: str, build: _Build) -> Plant:
         second_order=None if rides else ("m_k", "b_m"),
         inputs=("Fe1", "Fe2") if build.external else (),
         ports=_ports(name, build),
-        recipe=Recipe(parts=build.parts, make=partial(_remake, name, build)),
+        recipe=Recipe(parts=build.parts, make=partial(remake, _actuator, name, build)),
     )
-
-
-def _remake(name: str, build: _Build, parts: tuple[Part, ...]) -> Plant:
-    return _actuator(name, replace(build, parts=parts))
 
 
 def _list_outputs(build: _Build) -> dict[str, tuple[str, Any]]:

@@ -16,12 +16,12 @@ from jaxtyping import Bool, Float, Shaped
 
 from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
-from seaopt.signals import VectorM
+from seaopt.signals import VectorM, VectorX
 from seaopt.simulation.discretisation import Clock, transition
 from seaopt.simulation.integrator import output_function, rate_functions, step_function
 from seaopt.simulation.model import Model
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, load_library, row_addresses
-from seaopt.simulation.passes import Layout, Pass, Point, Segment, Weights, layout_of
+from seaopt.simulation.passes import DoubleSum, Influence, Lagged, Layout, Pass, Point, Segment, Weights, layout_of
 
 PARALLEL = 20_000  # samples below which a second thread does not pay
 FORGOTTEN = 1e-24  # of a state, in any units: far below rounding
@@ -156,11 +156,8 @@ def _load_sums() -> ctypes.CDLL | None:
 
 
 def double_sum_of_columns(
-    columns: Float[np.ndarray, "n ny nc"],
-    counted: Bool[np.ndarray, "n ny"],
-    into: Float[np.ndarray, "ny p nc"],
-    r: Float[np.ndarray, "lags1 ny ny"],
-) -> Float[np.ndarray, "2 p p"] | None:
+    columns: Float[np.ndarray, "n ny nc"], counted: Bool[np.ndarray, "n ny"], into: Influence, r: Lagged
+) -> DoubleSum | None:
     """Return what `Program.double_sum` does, of columns that are there."""
     sums = _load_sums()
     if sums is None:
@@ -194,7 +191,7 @@ def _lay_out_influences(into: Any, r: Any, arguments: Any) -> tuple[Any, Any, An
     return arguments, (padded, halved, ring, form), form
 
 
-def _halve_form(form: Any, p: int) -> Float[np.ndarray, "2 p p"]:
+def _halve_form(form: Any, p: int) -> DoubleSum:
     total = np.sum(form, axis=0)
     return (total + total.transpose(0, 2, 1))[:, :p, :p]
 
@@ -294,7 +291,7 @@ class Program:
         self,
         first: int,
         last: int,
-        x0: Float[np.ndarray, " nx"],
+        x0: VectorX,
         *,
         sums: bool = True,
         outputs: bool = False,
@@ -336,9 +333,7 @@ class Program:
         self.kernel.run(arguments, buffers, parallel=n >= PARALLEL)
         return Pass(gram=np.sum(gram, axis=0), loss=np.sum(loss, axis=0), count=np.sum(count, axis=0), **kept)
 
-    def double_sum(
-        self, x0: Float[np.ndarray, " nx"], into: Float[np.ndarray, "ny p nc"], r: Float[np.ndarray, "lags1 ny ny"]
-    ) -> Float[np.ndarray, "2 p p"]:
+    def double_sum(self, x0: VectorX, into: Influence, r: Lagged) -> DoubleSum:
         """Return the sum over t, s of a(t)' R(t - s) a(s), and its part t = s; a: influences that count into v."""
         edges, starts, warm = self._split(0, self.segment.n, x0, halve=True)
         warm[1:] += len(r)  # influences reach so far back
@@ -355,7 +350,7 @@ class Program:
             arguments[name] = row_addresses(array)
         return arguments
 
-    def _split(self, first: int, last: int, x0: Float[np.ndarray, " nx"], *, halve: bool) -> tuple[Any, Any, Any]:
+    def _split(self, first: int, last: int, x0: VectorX, *, halve: bool) -> tuple[Any, Any, Any]:
         """Return edges, starts and run-up of what runs at once: two halves where the state is soon forgotten, or one.
         The second half starts at zero and forgets it before it counts.
         """

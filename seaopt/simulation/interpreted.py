@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from seaopt.plants.memo import memo
 from seaopt.records import record
-from seaopt.signals import VectorM, VectorN
+from seaopt.signals import VectorM, VectorN, VectorX
 from seaopt.simulation.discretisation import Hold, transition
 from seaopt.simulation.integrator import output_function, step_function
 from seaopt.simulation.model import Model
@@ -29,9 +29,7 @@ Trajectory = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Floa
 
 
 @np.errstate(all="ignore")  # a plant that overflows gives numbers that are not finite, as the compiled pass does
-def interpret_pass(
-    model: Model, segment: Segment, point: Point, weights: Weights, stop: int, x0: Float[np.ndarray, " nx"]
-) -> Pass:
+def interpret_pass(model: Model, segment: Segment, point: Point, weights: Weights, stop: int, x0: VectorX) -> Pass:
     """Run the samples before `stop` in NumPy and CasADi's virtual machine; keep outputs, columns and states."""
     layout, forcing = layout_of(model.nx, model.ny, model.np, point), _inputs_in_force(segment, point)[:stop]
     if model.linear and point.correction is None:
@@ -73,7 +71,7 @@ def _inputs_in_force(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]
 
 
 def _linear_trajectory(
-    model: Model, layout: Layout, point: Point, forcing: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]
+    model: Model, layout: Layout, point: Point, forcing: Float[np.ndarray, "n w"], x0: VectorX
 ) -> Trajectory:
     """Return the trace of a linear plant: the state first, which with the inputs drives its derivatives."""
     nx, count = model.nx, layout.states - 1
@@ -263,7 +261,7 @@ def _fold(
 
 
 def _folded_trajectory(
-    model: Model, segment: Segment, point: Point, forcing: Float[np.ndarray, "n w"], x0: Float[np.ndarray, " nx"]
+    model: Model, segment: Segment, point: Point, forcing: Float[np.ndarray, "n w"], x0: VectorX
 ) -> Trajectory:
     """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
     layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(point)
@@ -274,7 +272,7 @@ def _folded_trajectory(
         data = np.append(model.parameters(point.theta), (clock.fraction_s, clock.period - clock.fraction_s))
     w, plant_size = np.column_stack([time, forcing[:, :-1]]), data.size
     if point.correction is not None:
-        measured, present = _read_measured(segment, len(forcing))
+        measured, present = read_measured(segment, len(forcing))
         w = np.hstack([w, measured, present, segment.drift_basis(slice(0, len(forcing)), layout.drift_terms)])
         sensors = (point.offset, point.gain, point.drift, point.correction)
         data = np.concatenate([data, *(np.asarray(values).ravel() for values in sensors)])
@@ -289,7 +287,7 @@ def _folded_trajectory(
     return y[:, :, 0], y[:, :, 1:], path[:-1, :, 0]
 
 
-def _read_measured(segment: Segment, stop: int) -> tuple[Float[np.ndarray, "n ny"], Any]:
+def read_measured(segment: Segment, stop: int) -> tuple[Float[np.ndarray, "n ny"], Any]:
     """Return the measured outputs, zero where missing, and which are present."""
     measured = np.column_stack([channel[:stop] for channel in segment.y])
     present = np.isfinite(measured)
@@ -307,7 +305,7 @@ def _columns(
     dy: Float[np.ndarray, "n ny nt"],
 ) -> tuple[Float[np.ndarray, "n ny nc"], Any]:
     """Return v of every sample, and which samples count."""
-    measured, present = _read_measured(segment, len(y))
+    measured, present = read_measured(segment, len(y))
     basis = segment.drift_basis(slice(0, len(y)), point.drift_terms)
     v = np.zeros((len(y), layout.ny, layout.columns))
     v[:, :, 0] = point.read(y.T, segment, slice(0, len(y))).T - measured

@@ -19,6 +19,9 @@ from seaopt.simulation.discretisation import Clock
 
 MAX_SECTIONS = 8  # as in layout.h
 RobustLoss = Literal["square", "huber", "soft_l1"]
+Influence = Float[np.ndarray, "ny p nc"]  # of the column v of an output on p estimates
+DoubleSum = Float[np.ndarray, "2 p p"]  # over all t and s, and over t = s
+Lagged = Float[np.ndarray, "lags1 ny ny"]  # R(k) of outputs, a lag each
 
 
 @record(eq=False)

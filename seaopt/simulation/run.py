@@ -9,14 +9,12 @@ from dataclasses import replace
 from threading import Lock
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
+from seaopt.signals import VectorX
 from seaopt.simulation.compiled import Program, double_sum_of_columns
 from seaopt.simulation.discretisation import check_period
-from seaopt.simulation.interpreted import interpret_pass
+from seaopt.simulation.interpreted import interpret_pass, read_measured
 from seaopt.simulation.model import Model
-from seaopt.simulation.passes import Pass, Point, Segment, Weights
+from seaopt.simulation.passes import DoubleSum, Influence, Lagged, Pass, Point, Segment, Weights
 
 STREAM_SAMPLES = 1 << 16  # of a stream that are in memory at a time
 KEPT_BYTES = 1 << 26  # of the passes that are kept at a time
@@ -79,7 +77,7 @@ def _measure_bytes(result: Pass) -> int:
     return result.gram.nbytes + sum(array.nbytes for array in (result.outputs, result.columns) if array is not None)
 
 
-def _key(model: Model, segment: Segment, point: Point, x0: Float[np.ndarray, " nx"], weights: Weights) -> Any:
+def _key(model: Model, segment: Segment, point: Point, x0: VectorX, weights: Weights) -> Any:
     """Return what tells passes apart; models and segments are told by their identity, for they are kept as well."""
     arrays = (point.theta, point.offset, point.gain, point.drift, point.correction, x0, weights.sections, weights.knee)
     numbers = tuple(None if array is None else array.tobytes() for array in arrays)
@@ -90,7 +88,7 @@ def run_passes(
     model: Model,
     segment: Segment,
     point: Point,
-    x0: Float[np.ndarray, " nx"],
+    x0: VectorX,
     weights: Weights | None = None,
     *,
     stop: int | None = None,
@@ -157,7 +155,7 @@ def stream(
     model: Model,
     segment: Segment,
     point: Point,
-    x0: Float[np.ndarray, " nx"],
+    x0: VectorX,
     weights: Weights | None = None,
     *,
     chunk: int = STREAM_SAMPLES,
@@ -187,14 +185,8 @@ def stream(
 
 
 def double_sum(
-    model: Model,
-    segment: Segment,
-    point: Point,
-    x0: Float[np.ndarray, " nx"],
-    weights: Weights,
-    into: Float[np.ndarray, "ny p nc"],
-    r: Float[np.ndarray, "lags1 ny ny"],
-) -> Float[np.ndarray, "2 p p"] | None:
+    model: Model, segment: Segment, point: Point, x0: VectorX, weights: Weights, into: Influence, r: Lagged
+) -> DoubleSum | None:
     """Return the sum over t and s of a(t)' R(t - s) a(s), and of it what t = s gives; None where there is no compiler.
 
     Both are summed in one pass.
@@ -213,8 +205,6 @@ def double_sum(
     if not kept or kept.columns is None:
         program = Program.make(model, segment, point, weights)
         return None if program is None else program.double_sum(x0, into, r)
-    counted = np.isfinite(np.column_stack(segment.y))
-    if segment.keep:
-        counted &= np.column_stack(segment.keep) > 0
+    _, counted = read_measured(segment, segment.n)
     counted[: weights.settle] = False
     return double_sum_of_columns(kept.columns, counted, into, r)

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.errors import LogError, SimulationError, require_number, require_type, suggestion
 from seaopt.logs import Log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import fill_vector
-from seaopt.signals import Signal, VectorN
+from seaopt.signals import Signal, VectorN, VectorX
 from seaopt.simulation.discretisation import Clock, Hold
 from seaopt.simulation.model import Model, make_model
 from seaopt.simulation.passes import Pass, Point, Segment
@@ -128,7 +127,7 @@ def simulate(
     return Log(time=log.time.copy(), signals=signals, source=f"simulation of {plant.name}")
 
 
-def _run_to_tolerance(model: Model, segment: Segment, x0: Float[np.ndarray, " nx"], clock: Clock, rtol: float) -> Pass:
+def _run_to_tolerance(model: Model, segment: Segment, x0: VectorX, clock: Clock, rtol: float) -> Pass:
     def run(substeps: int, model: Model = model) -> Pass:
         point = Point(
             theta=np.zeros(0), offset=np.zeros(model.ny), gain=np.ones(model.ny), clock=clock, substeps=substeps

@@ -23,6 +23,8 @@ An output that contains accelerations contains the friction: at a joint that sta
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -69,9 +71,9 @@ def sticking_line_step(plant: Plant) -> ca.Function:
     def find_input(s: Any) -> Any:
         return u0 + s * (u1 - u0)
 
-    def slide(s: Any, x: Any) -> Any:
+    def slide(s: Any, x: Any, change: Callable[[Any], Any] = lambda force: force) -> Any:
         u = find_input(s)
-        return h * joints.rate(t + s * h, x, u, p, joints.slide(x, u, p, signs))
+        return h * joints.rate(t + s * h, x, u, p, change(joints.slide(x, u, p, signs)))
 
     end = runge_kutta_step(slide, 0.0, x, 1.0)
     after = joints.speeds(end, p)
@@ -83,11 +85,8 @@ def sticking_line_step(plant: Plant) -> ca.Function:
     middle = runge_kutta_step(slide, 0.0, x, share)
 
     def hold(forces: Any) -> Any:
-        def rate(s: Any, x: Any) -> Any:
-            u = find_input(s)
-            return h * joints.rate(t + s * h, x, u, p, ca.if_else(first, forces, joints.slide(x, u, p, signs)))
-
-        return runge_kutta_step(rate, share, middle, 1.0 - share)
+        held = partial(slide, change=lambda sliding: ca.if_else(first, forces, sliding))
+        return runge_kutta_step(held, share, middle, 1.0 - share)
 
     levels = joints.levels(middle, find_input(share), p)
     free, pushed = hold(0.0 * levels), [hold(force) for force in _push_each(levels)]

@@ -15,6 +15,7 @@ from seaopt.records import record
 from seaopt.reporting.sections.data import Cell, Mark, Section, Table, Verdict, mark_met
 
 WIDTH = 80
+INDENT = 2
 LEAST = 20  # characters of a wrapped text
 NARROW = 16  # characters of a text in a table that is never broken
 GAP = 2
@@ -50,14 +51,14 @@ def render_sections(sections: Iterable[Section], width: int = WIDTH, most: Most 
             continue
         lines += [(), *_wrap_title(section, width)]
         for sentence in section.sentences:
-            lines += wrap(sentence, width, indent=2)
+            lines += wrap(sentence, width, indent=INDENT)
         for table in section.tables:
             lines += render_table(table, width, most=most.rows)
         for remark in section.remarks:
-            lines += wrap(remark, width, indent=2, style="dim")
+            lines += wrap(remark, width, indent=INDENT, style="dim")
         for item in section.items[: most.items]:
-            lines += _wrap_label(Mark(text=item.severity, style=item.severity), item.text, width, indent=2)
-        lines += _count_hidden(len(section.items), most.items, 2)
+            lines += _wrap_label(Mark(text=item.severity, style=item.severity), item.text, width, indent=INDENT)
+        lines += _count_hidden(len(section.items), most.items)
     return lines
 
 
@@ -76,11 +77,11 @@ def render_verdict(verdict: Verdict, width: int = WIDTH, most: Most | None = Non
     return lines
 
 
-def render_table(table: Table, width: int = WIDTH, *, indent: int = 2, most: int | None = None) -> list[Line]:
+def render_table(table: Table, width: int = WIDTH, *, most: int | None = None) -> list[Line]:
     """Return the lines of a table, none of them wider than `width` where its words and numbers allow it."""
     if not table.rows:
         return []
-    table, room = table.drop_empty(), width - indent
+    table, room = table.drop_empty(), width - INDENT
     widths = _choose_widths(table, room)
     for optional in reversed(table.optional):
         if _measure(widths) <= room:
@@ -94,8 +95,8 @@ def render_table(table: Table, width: int = WIDTH, *, indent: int = 2, most: int
     lines: list[Line] = []
     for block in blocks:
         widths = _choose_widths(block, room, broken=True)
-        lines += _lay_out(block, widths, indent, most)
-    return lines + _count_hidden(len(table.rows), most, indent)
+        lines += _lay_out(block, widths, most)
+    return lines + _count_hidden(len(table.rows), most)
 
 
 def wrap(text: str, width: int = WIDTH, *, indent: int = 0, style: str = "") -> list[Line]:
@@ -128,7 +129,7 @@ def _wrap_label(mark: Mark, text: str, width: int, *, indent: int = 0) -> list[L
     return [head, *(((" " * left + line, ""),) for line in more)]
 
 
-def _count_hidden(count: int, most: int | None, indent: int) -> list[Line]:
+def _count_hidden(count: int, most: int | None, indent: int = INDENT) -> list[Line]:
     hidden = 0 if most is None else count - most
     return wrap(f"and {hidden} more: --verbose prints them", indent=indent) if hidden > 0 else []
 
@@ -170,7 +171,7 @@ def _split(table: Table, widths: Sequence[int], room: int) -> Iterator[Table]:
         start = stop
 
 
-def _lay_out(table: Table, widths: Sequence[int], indent: int, most: int | None) -> Iterator[Line]:
+def _lay_out(table: Table, widths: Sequence[int], most: int | None) -> Iterator[Line]:
     rows: list[tuple[tuple[Cell, ...], str]] = [(row, "") for row in table.rows[:most]]
     if any(table.head):
         rows.insert(0, (table.head, "dim"))
@@ -178,7 +179,7 @@ def _lay_out(table: Table, widths: Sequence[int], indent: int, most: int | None)
         cells = [_break(_text(cell), width) for cell, width in zip(row, widths, strict=True)]
         styles = [COLOURS[cell.style] if isinstance(cell, Mark) else style for cell in row]
         for line in zip_longest(*cells, fillvalue=""):
-            spans: list[tuple[str, str]] = [(" " * indent, "")]
+            spans: list[tuple[str, str]] = [(" " * INDENT, "")]
             for at, (part, width, shade) in enumerate(zip(line, widths, styles, strict=True)):
                 last = at == len(widths) - 1
                 side = part.rjust(width) if _align(table, at) == ">" else part if last else part.ljust(width)
