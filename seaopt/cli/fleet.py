@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from seaopt.cli.progress import show_progress
 from seaopt.cli.show import show_sections, show_verdicts
-from seaopt.cli.terminal import Amount, Terminal
+from seaopt.cli.terminal import Amount, Terminal, spell_call
 from seaopt.errors import LogError, SeaoptError
 from seaopt.files import read_json, to_json, write_json
 from seaopt.formatting import format_count
@@ -131,7 +131,7 @@ def _write(fleet: Fleet, drift: Drift, population: Population | None, folder: Pa
         population=population,
         title=f"Fleet: {problem.stem}",
         files=[problem],
-        command=" ".join(["seaopt", *sys.argv[1:]]),
+        command=spell_call(),
     )
     return content
 

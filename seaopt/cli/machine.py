@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,7 +16,7 @@ from seaopt.cli.progress import show_progress
 from seaopt.cli.provenance import FILES
 from seaopt.cli.session import SCHEMAS, Session
 from seaopt.cli.show import show_sections, show_verdicts
-from seaopt.cli.terminal import Amount, Terminal
+from seaopt.cli.terminal import Amount, Terminal, spell_call
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
 from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
@@ -156,7 +155,7 @@ def _find_others(folder: Path, own: Path, controller: Controller) -> dict[str, C
 
 def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[str, Any]:
     """Write acceptance.json and its page; return the content of the first."""
-    command = shlex.join(["seaopt", *sys.argv[1:]])
+    command = spell_call()
     content = result.to_dict() | {"problem": session.problem.source}
     write_json(session.folder / FILE, content)
     files = [Path(session.problem.source), *logs]
@@ -241,7 +240,7 @@ def plan_bring_up(
         target / "bringup.html",
         title=f"Bring-up: {session.problem.title}",
         files=[Path(session.problem.source)],
-        command=shlex.join(["seaopt", *sys.argv[1:]]),
+        command=spell_call(),
     )
     files = [target / "bringup.json", page, *(target / stage.name for stage in plan.stages)]
     return _show(plan, plan.to_dict(), files, json=json, amount=amount)

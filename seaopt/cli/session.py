@@ -17,7 +17,7 @@ from seaopt import __version__
 from seaopt.cli.progress import LEAST_SHARE, show_progress
 from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_sources
 from seaopt.cli.show import show_results, show_verdicts
-from seaopt.cli.terminal import Amount, Terminal
+from seaopt.cli.terminal import Amount, Terminal, spell_call
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
 from seaopt.control.frontier.frontier import FRONTIER_SCHEMA
 from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, split_delayed, warn_delays
@@ -467,7 +467,7 @@ class Session:
             title=self.problem.title,
             progress=tell,
             files=[self.problem.source],
-            command=shlex.join(["seaopt", *sys.argv[1:]]),
+            command=spell_call(),
             expectations=self._expected(),
         )
         self.results["report"] = page

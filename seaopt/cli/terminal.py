@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import shlex
 import sys
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
@@ -125,3 +126,8 @@ def add_remedy(error: SeaoptError, commands: Collection[str]) -> str:
     if isinstance(error, LogError | FileError | UnitError) or command in ("", "inspect", "new", "export", "schema"):
         return f"{text}; for what may be given type seaopt {f'{command} ' if command else ''}--help"
     return f"{text}; for every key and what it means type seaopt schema problem"
+
+
+def spell_call() -> str:
+    """Return the command that was typed, to be typed again."""
+    return shlex.join(["seaopt", *sys.argv[1:]])

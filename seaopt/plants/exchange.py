@@ -33,7 +33,7 @@ def to_control(plant: Plant, params: ParameterSet) -> Any:
 
     refuse_samples(plant)
     p = plant.complete(params).vector
-    f = ca.Function("f", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
+    f = ca.Function("f", plant.symbols, [plant.dynamics])
     h = output_function(plant)
 
     def update(t: float, x: Any, u: Any, _: Any) -> Any:
@@ -140,7 +140,7 @@ def _builder(plant: Plant, params: CompletedParameters, name: str) -> Any:
     p = {parameter: builder.add(parameter, "parameter", "tunable") for parameter in plant.parameters}
     taken = {*x, *u, *p}
     y = [builder.add(f"{o}_out" if o in taken else o, "output") for o in plant.outputs]
-    equations = ca.Function("equations", [plant.x, plant.u, plant.p], [plant.dynamics, plant.output])
+    equations = ca.Function("equations", plant.symbols[1:], [plant.dynamics, plant.output])
     rates, outputs = equations(*(ca.vertcat(*named.values()) for named in (x, u, p)))
     for state, rate in zip(x.values(), ca.vertsplit(rates), strict=True):
         builder.eq(builder.der(state), rate)

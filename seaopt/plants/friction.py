@@ -340,7 +340,7 @@ class SeparatedFriction:
 def separate_friction(plant: Plant) -> SeparatedFriction:
     """Return the equations in the plant's own symbols t, x, u and p, and one symbol for each friction force."""
     forces = {name: ca.SX.sym(name) for name in plant.friction}
-    x, u, p = name_symbols(plant, plant.x, plant.u, plant.p)
+    x, u, p = name_symbols(plant, *plant.symbols[1:])
     for name, symbol in forces.items():
         setattr(u, name, symbol)
     f, h = plant.f(plant.t, x, u, p), plant.h(plant.t, x, u, p)
@@ -363,7 +363,7 @@ def friction_matrices(plant: Plant) -> Any:
         -ca.jacobian(ca.substitute(block, plant.t, 0.0), equations.forces) for block in (equations.f, equations.h)
     ]
     blocks = [ca.densify(block) for block in (*effects, ca.jacobian(equations.velocities, plant.x))]
-    return ca.Function("friction", [plant.x, plant.u, plant.p], blocks)
+    return ca.Function("friction", plant.symbols[1:], blocks)
 
 
 @memo
@@ -375,7 +375,7 @@ def rest_jacobians(plant: Plant) -> Any:
     if not remembers(plant):
         return jacobians(plant)
     equations = separate_friction(plant)
-    x, _, p = name_symbols(plant, plant.x, plant.u, plant.p)
+    x, _, p = name_symbols(plant, *plant.symbols[1:])
     stuck, rates = friction_states(plant)[STUCK], ca.SX(equations.f)
     velocities = dict(zip(plant.friction, ca.vertsplit(equations.velocities), strict=True))
     bend = dict.fromkeys(plant.friction, ca.SX(0))
@@ -390,4 +390,4 @@ def rest_jacobians(plant: Plant) -> Any:
         blocks.append(ca.jacobian(block, plant.u))
     nothing = ca.SX.zeros(*equations.forces.shape)
     still = ca.substitute(ca.substitute(blocks, [equations.forces], [nothing]), [plant.t], [ca.SX(0)])
-    return ca.Function("jacobians", [plant.x, plant.u, plant.p], [ca.densify(block) for block in still])
+    return ca.Function("jacobians", plant.symbols[1:], [ca.densify(block) for block in still])

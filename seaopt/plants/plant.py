@@ -170,6 +170,11 @@ class Plant:
         check_bristles(self, spaces)
 
     @property
+    def symbols(self) -> tuple[Any, Any, Any, Any]:
+        """The symbols t, x, u and p, of which `dynamics` and `output` are expressions."""
+        return self.t, self.x, self.u, self.p
+
+    @property
     def port(self) -> Port | None:
         """The port that is loaded, struck, held and looked at: the first; None without any."""
         return self.ports[0] if self.ports else None
@@ -230,7 +235,7 @@ class Plant:
         """Return the energy (J) as an expression of x and p. Raises PlantError: the plant declares none."""
         if self.energy is None:
             raise PlantError(f"plant {self.name} declares no energy; give energy=lambda x, p: ... when it is made")
-        x, _, p = name_symbols(self, self.x, self.u, self.p)
+        x, _, p = name_symbols(self, *self.symbols[1:])
         return ca.SX(self.energy(x, p))
 
     def linearize(
@@ -392,13 +397,13 @@ def require_plant(value: Any, argument: str, error: type[SeaoptError]) -> None:
 def dynamics_function(plant: Plant) -> Any:
     """Return the CasADi function (x, u, p) -> f at t = 0."""
     dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
-    return ca.Function("dynamics", [plant.x, plant.u, plant.p], [ca.densify(dynamics)])
+    return ca.Function("dynamics", plant.symbols[1:], [ca.densify(dynamics)])
 
 
 @memo
 def output_function(plant: Plant) -> Any:
     """Return the CasADi function (t, x, u, p) -> h."""
-    return ca.Function("output", [plant.t, plant.x, plant.u, plant.p], [ca.densify(plant.output)])
+    return ca.Function("output", plant.symbols, [ca.densify(plant.output)])
 
 
 def agree(first: Plant, second: Plant) -> bool:
@@ -428,7 +433,7 @@ def jacobians(plant: Plant) -> Any:
         for variable in (plant.x, plant.u)
     ]
     blocks = [ca.substitute(block, plant.t, 0.0) for block in blocks]
-    return ca.Function("jacobians", [plant.x, plant.u, plant.p], blocks)
+    return ca.Function("jacobians", plant.symbols[1:], blocks)
 
 
 def name_parameters(plant: Plant, p: Any) -> SimpleNamespace:
@@ -446,7 +451,7 @@ def name_symbols(plant: Plant, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace,
 def _deflection_slope(plant: Plant) -> Any:
     """Return the CasADi function (x, p) -> derivative of the spring's deflection by the states."""
     assert plant.spring is not None
-    x, _, p = name_symbols(plant, plant.x, plant.u, plant.p)
+    x, _, p = name_symbols(plant, *plant.symbols[1:])
     slope = ca.jacobian(ca.SX(plant.spring.deflection(x, p)), plant.x)
     return ca.Function("deflection", [plant.x, plant.p], [ca.densify(slope)])
 

@@ -45,7 +45,7 @@ SWEEPS = 30  # over the forces of several joints that stop at once
 
 def separate_jumps(plant: Plant) -> tuple[Any, Any, Any]:
     """Return f and h without friction that jumps, and what holds each joint at rest, in the plant's symbols."""
-    joints, arguments = _Joints(plant), [plant.t, plant.x, plant.u, plant.p]
+    joints, arguments = _Joints(plant), plant.symbols
     levels = joints.levels(*arguments[1:])
     return joints.rate(*arguments, 0.0 * levels), joints.read(*arguments, 0.0 * levels), levels
 
@@ -55,7 +55,7 @@ def sticking_step(plant: Plant) -> ca.Function:
     """Return the CasADi function (t, x, u, p, h) -> x+ of one step with friction that jumps, u held."""
     h = ca.SX.sym("h")
     after = sticking_line_step(plant)(plant.t, plant.x, plant.u, plant.u, plant.p, h)
-    return ca.Function("step", [plant.t, plant.x, plant.u, plant.p, h], [after])
+    return ca.Function("step", [*plant.symbols, h], [after])
 
 
 @memo
@@ -101,7 +101,7 @@ def sticking_line_step(plant: Plant) -> ca.Function:
 def sticking_output(plant: Plant) -> ca.Function:
     """Return the CasADi function (t, x, u, p) -> y of a plant with friction that jumps."""
     joints = _Joints(plant)
-    t, x, u, p = plant.t, plant.x, plant.u, plant.p
+    t, x, u, p = plant.symbols
     speeds, levels = joints.speeds(x, p), joints.levels(x, u, p)
     slide = joints.slide(x, u, p, joints.signs(t, x, u, p))
     push = joints.accelerate(t, x, u, p, 0.0 * levels)
@@ -125,7 +125,7 @@ def joint_equations(plant: Plant) -> tuple[Any, Any, Any, Any]:
     are expressions of the plant's own symbols, and of m: 1 or -1 where the joint slides that way, 0 where it is held.
     """
     joints, mode, force = _Joints(plant), ca.SX.sym("mode"), ca.SX.sym("force")
-    t, x, u, p = plant.t, plant.x, plant.u, plant.p
+    t, x, u, p = plant.symbols
     level = joints.levels(x, u, p)
     free = joints.accelerate(t, x, u, p, 0.0)
     holding = free / (free - joints.accelerate(t, x, u, p, 1.0))
@@ -141,7 +141,7 @@ class _Joints:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.jumps = [(force.jump, force.add_loads) for force in plant.friction.values() if force.jump and force.jumps]
-        equations, spaces = separate_friction(plant), name_symbols(plant, plant.x, plant.u, plant.p)
+        equations, spaces = separate_friction(plant), name_symbols(plant, *plant.symbols[1:])
         chosen: list[Any] = []
         velocities: list[Any] = []
         forces, every = ca.vertsplit(equations.forces), ca.vertsplit(equations.velocities)
@@ -153,7 +153,7 @@ class _Joints:
             else:  # its curve is all there is
                 curve = friction.force_at(*spaces)
                 f, h = ca.substitute(f, force, curve), ca.substitute(h, force, curve)
-        state, arguments = [plant.x, plant.p], [plant.t, plant.x, plant.u, plant.p, ca.vertcat(*chosen)]
+        state, arguments = [plant.x, plant.p], [*plant.symbols, ca.vertcat(*chosen)]
         speeds = ca.vertcat(*velocities)
         self.speeds = ca.Function("speeds", state, [speeds])
         self.rate = ca.Function("rate", arguments, [f])

@@ -143,10 +143,9 @@ def check_bristles(plant: Plant, spaces: list[SimpleNamespace]) -> None:
         slip, speed = ca.SX(friction.find_rate(x, u, p)), ca.SX(friction.velocity(x, p))
         moves = ca.jtimes(ca.SX(bristles.coordinate(x, p)), plant.x, plant.dynamics)
         stated = plant.dynamics[list(plant.states).index(bristles.state)]
-        symbols = [plant.t, plant.x, plant.u, plant.p]
         rng = np.random.default_rng(0)
-        values = [rng.uniform(0.5, 1.5, symbol.shape[0]) for symbol in symbols]
-        rates = map(float, ca.Function("bristles", symbols, [stated, slip, moves, speed]).call(values))
+        values = [rng.uniform(0.5, 1.5, symbol.shape[0]) for symbol in plant.symbols]
+        rates = map(float, ca.Function("bristles", plant.symbols, [stated, slip, moves, speed]).call(values))
         for message in (
             f'f gives "{bristles.state}" another rate than bristles.rate; use the same in both',
             "the rate of bristles.coordinate is not the velocity; give the coordinate it belongs to",

@@ -90,7 +90,7 @@ def find_scale(plant: Plant, params: CompletedParameters, output: str) -> float 
     motor, names = list(plant.states).index(str(sensing.motor_position)), list(plant.outputs)
     rows = [names.index(name) for name in (output, sensing.regulated[0])]
     slopes = ca.densify(ca.jacobian(plant.output, plant.x[motor])[rows])
-    at_rest = ca.Function("slopes", [plant.t, plant.x, plant.u, plant.p], [slopes])
+    at_rest = ca.Function("slopes", plant.symbols, [slopes])
     read, own = at_rest(0.0, 0.0, 0.0, params.vector).full().ravel().tolist()
     return read / own if read and own else None
 
