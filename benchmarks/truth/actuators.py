@@ -102,13 +102,14 @@ class Actuator:
         """
         values, p = dict(self.truth), _list_parameters(self)
         if p["hysteresis"]:
-            current = self._draw_current(seconds, np.random.default_rng(seed))
+            current = self.draw_current(seconds, np.random.default_rng(seed))
             q, phi, *_ = self._play(np.ascontiguousarray(np.round(current, 3)), 1.0 / RATE_HZ, None).T
             if np.max(np.abs(q / p["ratio"] - phi)) < p["give_way"]:
                 values["k" if KINDS[self.kind].linear else "k_s"] += p["hysteresis"]
         return values
 
-    def _draw_current(self, seconds: float, rng: np.random.Generator) -> np.ndarray:
+    def draw_current(self, seconds: float, rng: np.random.Generator) -> np.ndarray:
+        """Return a chirp on a multisine, of the largest amplitude."""
         time = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
         return self._largest_current() * _excite(time, KINDS[self.kind].chirp_hz, rng)
 
@@ -116,7 +117,7 @@ class Actuator:
         """Return time, current and readings under a chirp on a multisine; the amplitude is a share of the largest."""
         kind, rng = KINDS[self.kind], np.random.default_rng(seed)
         time = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
-        current = amplitude * self._draw_current(seconds, rng)
+        current = amplitude * self.draw_current(seconds, rng)
         outputs = self.simulate(current)
         readings = {name: _read(outputs[name], kind.noise[name], kind.step[name], rng) for name in outputs}
         jitter = rng.normal(scale=2e-5, size=time.size)
