@@ -70,8 +70,8 @@ def test_results_with_a_verdict_share_its_words():
     }
     assert public <= {*list_results()}
     names = {each.__name__ for each in list_results()}
-    assert {"Fit", "Controller", "ForceMPC", "ScheduledController", "Certificate", "ScheduleCertificate", "Frontier",
-            "FrontierRow", "SlidingAlone", "Quality", "ConstrainedRuns", "Requirement", "Simulated",
+    assert {"Fit", "Controller", "ForceMPC", "ScheduledController", "Certificate", "Frontier", "FrontierRow",
+            "SlidingAlone", "Quality", "ConstrainedRuns", "Requirement", "Simulated",
             "Verification", "Outcome", "JointTuning", "Fleet"} <= names  # fmt: skip
 
 

@@ -32,7 +32,7 @@ from seaopt.problem import certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.problem.stages import list_plants
 from seaopt.reporting.sections import judge
-from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate, linear_controller
+from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.signals import REFERENCE
 
 FILE, PAGE = "acceptance.json", "acceptance.html"
@@ -207,7 +207,7 @@ def plan_bring_up(
         assert isinstance(tuned, Controller)
         return tuned
 
-    def certify_stage(law: Source) -> Certificate | ScheduleCertificate:
+    def certify_stage(law: Source) -> Certificate:
         if isinstance(law, ForceMPC):
             return certify_problem(replace(session.problem, mpc=law.spec), linear_controller(law), source)
         return certify_problem(session.problem, law, source)

@@ -20,7 +20,7 @@ from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
 from seaopt.control.frontier.frontier import FRONTIER_SCHEMA
-from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, split_delayed, warn_delays
+from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, warn_delays
 from seaopt.control.laws.stored import CONTROLLER_SCHEMA
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
@@ -56,7 +56,7 @@ from seaopt.reporting.responses import estimate_responses
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands, Verdict
 from seaopt.reporting.sections.verdict import UNMET, doubt_design, judge_expectations, name_guesses
-from seaopt.robustness import Certificate, JointTuning, ScheduleCertificate, linear_controller
+from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
 from seaopt.testing.expectations import list_expectations
 
@@ -475,16 +475,11 @@ class Session:
 
     def _read_certificate(self) -> None:
         """Take the folder's certificate."""
-        content, source, law = self._read("certify"), self.parameters(), self.law()
-        plants = self.problem.certified_plants()
-        if isinstance(law, ScheduledController):
-            self.results["certify"] = ScheduleCertificate.from_dict(
-                content, law, plants, source, ranges=self.problem.ranges, others=self.problem.parameters
-            )
-            return
-        assert self.problem.spec is not None
-        plants = split_delayed(self.problem.spec, self.problem.design_plant, plants, source)
-        self.results["certify"] = Certificate.from_dict(content, law, plants, self.values())
+        problem, content, law = self.problem, self._read("certify"), self.law()
+        options: dict[str, Any] = {"ranges": problem.ranges, "others": problem.parameters}
+        self.results["certify"] = Certificate.from_dict(
+            content, law, problem.certified_plants(), self.parameters(), **options
+        )
 
     def met(self, stages: list[str]) -> bool:
         """Tell whether everything that these stages require is met."""

@@ -22,7 +22,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
 from seaopt.records import Result, Worded, record
-from seaopt.robustness import Certificate, ScheduleCertificate, certify, tune_certified
+from seaopt.robustness import Certificate, certify, tune_certified
 from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.signals import REFERENCE
 
@@ -57,7 +57,7 @@ class Stage:
         What is exported.
     controller : Controller
         It, as a law: of a schedule where its variable stands, of predictive control while no limit is active.
-    certificate : Certificate or ScheduleCertificate
+    certificate : Certificate
     excitation : Excitation
         The reference to play.
     tracking, sensitivity : Band
@@ -77,7 +77,7 @@ class Stage:
     name: str
     source: Source
     controller: Controller
-    certificate: Certificate | ScheduleCertificate
+    certificate: Certificate
     excitation: Excitation
     tracking: Band
     sensitivity: Band
@@ -154,9 +154,9 @@ def bring_up(
     share: float = 0.5,
     bias: float = 0.0,
     limits: Mapping[str, float] | None = None,
-    certificate: Certificate | ScheduleCertificate | None = None,
+    certificate: Certificate | None = None,
     tune_stage: Callable[[ControllerSpec], Controller] | None = None,
-    certify_stage: Callable[[Any], Certificate | ScheduleCertificate] | None = None,
+    certify_stage: Callable[[Any], Certificate] | None = None,
     keep_stage: Callable[[Stage], object] | None = None,
     seed: int = SEED,
     progress: Progress = ignore,
@@ -224,7 +224,7 @@ def bring_up(
     if not 0.0 < require_number(share, "share", ControlError) <= 1.0:
         raise ControlError(f"share = {share:g} is not between 0 and 1; give the part of each limit to use: 0.5")
 
-    def certify_one(law: Any) -> Certificate | ScheduleCertificate:
+    def certify_one(law: Any) -> Certificate:
         return certify(law, plants, uncertainty, ranges=ranges, samples=samples, seed=seed)
 
     def tune_one(spec: ControllerSpec) -> Controller:
@@ -292,9 +292,9 @@ def _find_stage(
     controller: Controller,
     fraction: float,
     tuning: Callable[[ControllerSpec], Controller],
-    certifying: Callable[[Any], Certificate | ScheduleCertificate],
+    certifying: Callable[[Any], Certificate],
     tell: Callable[[str], None],
-) -> tuple[Source, Certificate | ScheduleCertificate, str]:
+) -> tuple[Source, Certificate, str]:
     """Return the law of a stage, its certificate, and in what it is another one than planned."""
     spec = controller.spec
     for factor in UPWARDS:
@@ -334,7 +334,7 @@ def _find_stage(
 def _make_stage(
     name: str,
     source: Source,
-    certificate: Certificate | ScheduleCertificate,
+    certificate: Certificate,
     note: str,
     draws: Sequence[Mapping[str, float]],
     options: Mapping[str, Any],

@@ -52,7 +52,6 @@ from seaopt.robustness import (
     Budget,
     Certificate,
     JointTuning,
-    ScheduleCertificate,
     certify,
     linear_controller,
     tune_certified,
@@ -446,7 +445,7 @@ def certify_problem(
     source: Fit | ParameterSet,
     progress: Progress = ignore,
     executor: Executor | None = None,
-) -> Certificate | ScheduleCertificate:
+) -> Certificate:
     """Certify a controller or schedule on the problem's plants, simulations included, as `seaopt certify` does.
 
     Parameters
@@ -490,8 +489,6 @@ def certify_problem(
         executor=executor,
         progress=progress,
     )
-    if isinstance(certificate, ScheduleCertificate):
-        return certificate
     unread, notes = [name for name in problem.sensors.names if name not in read], list(unread_logs)
     if unread:
         notes.append(f"errors of {', '.join(unread)} in sensors are in no run: the law reads {', '.join(read)}")

@@ -30,6 +30,7 @@ from seaopt.reporting.figures.frontier import frontier_panel
 from seaopt.reporting.figures.impedance import region_panel
 from seaopt.reporting.figures.panel import Panel, compose_sheet, draw_panel
 from seaopt.reporting.figures.ranking import evidence_panel, octave_panels
+from seaopt.reporting.figures.schedule import schedule_panels
 from seaopt.robustness import Certificate
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.verification import Verification
@@ -241,8 +242,21 @@ def _list_sweeps(certificate: Certificate) -> tuple[LargeSignal, ...]:
     return sweeps
 
 
+def _list_certificate(certificate: Certificate) -> Iterator[Callable[[], Panels]]:
+    if certificate.schedule is not None:
+        yield partial(schedule_panels, certificate.schedule, certificate)
+        yield partial(certificates.requirements_panel, certificate)
+        return
+    for panel in (certificates.requirements_panel, certificates.worst_panel, certificates.draws_panel, _draw_steps):
+        yield partial(panel, certificate)
+    yield partial(certificates.friction_panel, certificate)
+    yield partial(_draw_bandwidths, certificate)
+
+
 def _draw_steps(certificate: Certificate, *, size: float = 1.0, duration_s: float | None = None) -> Panel:
     """Draw the step response of every plant, linear; `ax` is a sequence of two Axes."""
+    if certificate.schedule is not None:
+        raise ControlError("a schedule has a step at each of its places: certificate.places[0].plot.step()")
     plants = certificates.plants_of(certificate)
     return loops.step_panel(certificate.controller, plants, size=size, duration_s=duration_s)
 
@@ -344,7 +358,7 @@ KINDS = {
             "environments": _draw_environments,
             "impedance": _draw_impedance,
         },
-        sheet=("requirements", "sensitivity", "draws", "step", "friction", "bandwidth"),
+        sheet=_list_certificate,
     ),
     "Verification": Kind(figures={"runs": _draw_runs}),
     "LargeSignal": Kind(

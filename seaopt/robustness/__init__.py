@@ -7,7 +7,6 @@ from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns, linear_controller
 from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
 from seaopt.robustness.certificate.requirement import Requirement
-from seaopt.robustness.certificate.scheduled import ScheduleCertificate
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty, place_value
@@ -24,7 +23,7 @@ from seaopt.robustness.verification.verification import Verification, verify
 __all__ = [
     "BatchFigures", "Bracket", "Budget", "Certificate", "ConstrainedRuns", "JointTuning", "LargeSignal",
     "MonteCarlo", "Outcome", "Phase", "PlantMargins", "Requirement", "Round", "Scenario",
-    "ScheduleCertificate", "Simulated", "StabilityMap", "StretchBound", "Sweep", "Uncertainty", "Verification",
+    "Simulated", "StabilityMap", "StretchBound", "Sweep", "Uncertainty", "Verification",
     "Witness", "Worst", "batch_figures", "bracket", "certify", "check_ranges",
     "combine_uncertainty", "coupled_stability", "default_scenarios", "failure_bound", "large_signal",
     "linear_controller", "place_value", "plant_margins", "run_simulations", "sweep_schedule", "tune_certified",

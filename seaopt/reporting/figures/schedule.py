@@ -10,13 +10,13 @@ import numpy as np
 from seaopt.control import ScheduledController
 from seaopt.reporting.figures.fit import label_channel
 from seaopt.reporting.figures.panel import BLUE, COLOURS, MEASURED, VERMILION, Panel, draw_level
-from seaopt.robustness import ScheduleCertificate
+from seaopt.robustness import Certificate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def schedule_panels(schedule: ScheduledController, certificate: ScheduleCertificate | None = None) -> list[Panel]:
+def schedule_panels(schedule: ScheduledController, certificate: Certificate | None = None) -> list[Panel]:
     """Return the figures of a schedule: gains, bandwidth, and Ms with what is proved of it."""
     panel = partial(Panel, x=label_channel(schedule.over, schedule.unit), link=schedule.over)
     return [
@@ -70,7 +70,7 @@ def _draw_bandwidth(schedule: ScheduledController, axis: Axes) -> None:
     axis.set_ylim(0.0, 1.15 * max([*asked, *(y for curve in curves for _, y in curve)]))
 
 
-def _draw_sensitivity(schedule: ScheduledController, certificate: ScheduleCertificate | None, axis: Axes) -> None:
+def _draw_sensitivity(schedule: ScheduledController, certificate: Certificate | None, axis: Axes) -> None:
     """Draw the largest Ms of all plants, the worst cases found, and the proved bound."""
     if certificate is None:
         rows = [(place.value, place.ms) for place in schedule.between]

@@ -38,7 +38,7 @@ from seaopt.reporting.sections.data import Section
 from seaopt.reporting.sections.kinds.responses import compare_with_fit
 from seaopt.reporting.sections.kinds.verification import describe_drawings
 from seaopt.reporting.sections.verdict import UNMET, describe_expectations, judge_results
-from seaopt.robustness import Certificate, ScheduleCertificate
+from seaopt.robustness import Certificate
 from seaopt.robustness.verification.environments import StabilityMap
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.verification import Verification
@@ -52,7 +52,6 @@ Result = (
     | Verification
     | StabilityMap
     | ScheduledController
-    | ScheduleCertificate
     | LargeSignal
 )
 KINDS: dict[str, type[Any]] = {
@@ -64,7 +63,6 @@ KINDS: dict[str, type[Any]] = {
     "verification": Verification,
     "coupled": StabilityMap,
     "schedule": ScheduledController,
-    "swept": ScheduleCertificate,
 }
 PARTS = {
     "expectations": "What the problem file expects",
@@ -100,7 +98,6 @@ class Material:
     verification: Verification | None = None
     coupled: StabilityMap | None = None
     schedule: ScheduledController | None = None
-    swept: ScheduleCertificate | None = None
     large: tuple[LargeSignal, ...] = ()
     passivity: Passivity | None = None
     diagnostics: Diagnostics | None = None
@@ -132,7 +129,7 @@ def write_report(
     Parameters
     ----------
     results : sequence of Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, LargeSignal
-        And ScheduledController, ScheduleCertificate. At most one of each, of LargeSignal any number; sections without a
+        And ScheduledController. At most one of each, of LargeSignal any number; sections without a
         result are left out. A fit that was not read from a file has a section of diagnostics. A certificate's
         simulations need not be listed.
     path : path
@@ -225,14 +222,14 @@ def _sort_results(results: Sequence[Result]) -> Material:
             by_kind[name] = matches[0]
     large = tuple(result for result in results if isinstance(result, LargeSignal))
     certificate: Certificate | None = by_kind.get("certificate")
-    if certificate is not None:
+    if certificate is not None and certificate.schedule is not None:
+        by_kind["schedule"] = certificate.schedule
+    elif certificate is not None:
         brought: dict[str, Any] = {"controller": certificate.controller, "verification": certificate.runs}
         if certificate.simulated is not None:
             brought |= {"coupled": certificate.simulated.environments, "passivity": certificate.simulated.passivity}
             large = large or certificate.simulated.large_signal
         by_kind = brought | by_kind
-    if "swept" in by_kind:
-        by_kind["schedule"] = by_kind["swept"].schedule
     if "fit" in by_kind and by_kind["fit"].minimum is not None:
         by_kind["diagnostics"] = diagnose(by_kind["fit"])
     return Material(**by_kind, large=large)
@@ -246,13 +243,13 @@ def _list_plates(material: Material) -> Iterator[Plate]:
         panels = [loops.LOOP_PANELS[name](controller, plants) for name in loops.MAIN]
         yield Plate(name="loop", part="controller", heading="The loop on every plant" if plants else "", panels=panels)
     if material.schedule is not None:
-        yield Plate(name="schedule", part="schedule", panels=schedule_panels(material.schedule, material.swept))
+        yield Plate(name="schedule", part="schedule", panels=schedule_panels(material.schedule, certificate))
     if fit is not None:
         yield from _list_plates_of_fit(fit, material.ranking, material.diagnostics)
     if material.ranking is not None:
         panels = [evidence_panel(material.ranking), *octave_panels(material.ranking)]
         yield Plate(name="ranking", part="ranking", panels=panels)
-    if certificate is not None:
+    if certificate is not None and certificate.schedule is None:
         yield Plate(name="certificate", part="certificate", panels=_list_certificate_panels(certificate))
     yield from _list_plates_of_simulation(material)
 
@@ -348,7 +345,7 @@ def _render(
         fit=fit,
         controller=material.schedule if controller is None else controller,
         mpc=material.mpc,
-        certificate=material.swept if certificate is None else certificate,
+        certificate=certificate,
         # the certificate speaks of its own runs
         verification=None if certificate is not None and runs is certificate.runs else runs,
         expectations=expectations,
@@ -357,7 +354,6 @@ def _render(
     results = (
         controller,
         material.schedule,
-        material.swept,
         material.mpc,
         fit,
         material.diagnostics,

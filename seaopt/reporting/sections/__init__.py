@@ -24,7 +24,6 @@ KINDS = {
     "ScheduledController": "schedule",
     "ForceMPC": "mpc",
     "Certificate": "certificate",
-    "ScheduleCertificate": "schedule_certificate",
     "Verification": "verification",
     "Diagnostics": "advice",
     "Ranking": "advice",

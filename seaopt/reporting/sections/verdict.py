@@ -9,7 +9,7 @@ from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.estimation import Fit
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Reason, Section, Table, Verdict, mark_met
-from seaopt.robustness import Certificate, ScheduleCertificate
+from seaopt.robustness import Certificate
 from seaopt.robustness.verification.verification import Verification
 
 UNMET = "on a fit that is not met"
@@ -20,7 +20,7 @@ def judge_results(
     fit: Fit | None = None,
     controller: Controller | ScheduledController | None = None,
     mpc: ForceMPC | None = None,
-    certificate: Certificate | ScheduleCertificate | None = None,
+    certificate: Certificate | None = None,
     verification: Verification | None = None,
     expectations: Sequence[tuple[bool, str]] = (),
 ) -> list[Verdict]:

@@ -1,8 +1,8 @@
 """The cases of a certificate, a law on its plants with each friction sliding and stuck, and what a check makes of them.
 
-A check measures the cases of a law, or of a schedule with its variable standing at one value, or what they say
-together, and gives evidence: requirements, fields of the certificate, and remarks. `certify` asks each that applies,
-one after the other: a check may read what those before it found.
+A schedule is the law that it is at each of its points and between them. A check measures the cases of a law, or what
+those of a schedule say together, and gives evidence: requirements, fields of the certificate, and remarks. `certify`
+asks each that applies, one after the other: a check may read what those before it found.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.laws.delay import Drive, find_drive, find_given_drive_delay, split_delayed
 from seaopt.control.loops.sampled_plant import DELAYS, DRIVE_DELAY
 from seaopt.control.running.fed_back import split_states
+from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner
 from seaopt.errors import ControlError
 from seaopt.estimation import Fit
 from seaopt.executors import Shared
 from seaopt.frequency import MeasuredResponse
 from seaopt.options import check_options, option
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import name_states
 from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
@@ -96,6 +97,7 @@ class Survey:
     options: CertifyOptions
     drawing: np.random.Generator  # of the draws that are counted
     rng: np.random.Generator  # of all others
+    others: ParameterSet = field(default_factory=ParameterSet)  # of parameters that the source does not have
     place: tuple[str, float] | None = None  # a schedule's variable and its value; draws are then judged together
     point: bool = True  # whether the law was tuned for just this
     steps: bool = True  # whether steps are simulated,
@@ -103,7 +105,7 @@ class Survey:
     sensors: Sensors | None = None
     measured: Mapping[str, MeasuredResponse] = field(default_factory=dict[str, MeasuredResponse])
     executor: Executor | None = None
-    places: Mapping[float, Survey] = field(default_factory=dict[float, Any])  # of a schedule as a whole, by value
+    places: Sequence[Survey] = ()  # of a schedule as a whole: those of its values
     found: Mapping[str, Any] = field(default_factory=dict[str, Any])  # fields of the certificate, of earlier checks
 
     @property
@@ -115,6 +117,12 @@ class Survey:
     def cases(self) -> Cases:
         """The cases as they are in this process."""
         return self.shared.value
+
+    @property
+    def schedule(self) -> ScheduledController:
+        """The subject of a check of a schedule as a whole."""
+        assert isinstance(self.subject, ScheduledController)
+        return self.subject
 
     @property
     def samples(self) -> int:
@@ -161,6 +169,39 @@ def ask(checks: Sequence[Check], survey: Survey, progress: Progress) -> Evidence
 def count_seconds(checks: Sequence[Check], survey: Survey) -> float:
     """Return how long the checks that apply take as a rule."""
     return sum(check.seconds(survey) for check in checks if check.applies(survey))
+
+
+def pose(
+    law: Controller | ScheduledController,
+    plants: Plants,
+    parameters: Source,
+    ranges: Ranges,
+    others: ParameterSet,
+    bounds: Budget | None = None,
+) -> dict[float | None, Cases]:
+    """Return the cases of a law, by None; of a schedule those of the law frozen at each value at which it is certified,
+    its points and between them. Raises ControlError: the variable has a range, or is estimated by the fit.
+    """
+    if isinstance(law, Controller):
+        return {None: pose_cases(law, plants, parameters, ranges, others, bounds)}
+    over, posed = law.over, dict[float | None, Cases]()
+    if over in ranges:
+        raise ControlError(f"range of {over}: the schedule is over it, and its points are its range; take it out")
+    if isinstance(parameters, Fit) and over in parameters.covariance.names:
+        raise ControlError(
+            f"{over} is estimated by the fit, and the schedule is over it; fix it in the experiments that are fitted"
+        )
+    alone = replace(law, others={})  # what it was tuned on besides is judged by the checks, with all other plants
+    for value in sorted({*law.points, *list_inner(law.points, PARTS)}):
+        variable, source, other = Parameter(name=over, value=value, unit=law.unit), parameters, others
+        if isinstance(source, ParameterSet):
+            source = source.with_parameters(variable)
+        elif over in source.parameters:
+            source = replace(source, parameters=source.parameters.with_parameters(variable))
+        else:
+            other = other.with_parameters(variable)
+        posed[value] = pose_cases(alone.at(value), plants, source, ranges, other, bounds)
+    return posed
 
 
 def pose_cases(

@@ -1,8 +1,8 @@
-"""The certificate as data, JSON and text: one controller on many plants."""
+"""The certificate as data and JSON: a law, a schedule or predictive control on many plants."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import field, replace
 from typing import Any
@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
-from seaopt.control import Controller, LoopFigures
+from seaopt.control import Controller, LoopFigures, ScheduledController
 from seaopt.control.laws.limits import BY_NAME
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.absolute_stability import FrictionMargin
@@ -28,11 +28,19 @@ from seaopt.plants.friction import friction_slopes, remembers
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.bounds.bracket import Bracket
+from seaopt.robustness.bounds.stretch import StretchBound
+from seaopt.robustness.certificate.cases import pose
 from seaopt.robustness.certificate.compensation import describe_compensation, list_compensation
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import MarginDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
 from seaopt.robustness.certificate.requirement import Requirement
+from seaopt.robustness.certificate.scheduled import (
+    find_common_rate,
+    name_rate_unit,
+    state_assumption,
+    state_proof,
+)
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,
@@ -42,12 +50,14 @@ from seaopt.robustness.certificate.simulated import (
     run_simulations,
     select_simulated,
 )
-from seaopt.robustness.uncertainty.draws import Plants, Varied
+from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source, Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.logs import LogVerdict
 from seaopt.robustness.uncertainty.plant_margins import PlantMargins
 from seaopt.robustness.uncertainty.worst import Worst
 from seaopt.robustness.verification.limit_cycles import FoundCycle
+from seaopt.robustness.verification.schedule_motion import Motion, describe_motion
+from seaopt.robustness.verification.schedule_sweep import Sweep, describe_sweeps
 from seaopt.robustness.verification.verification import Verification
 
 ROBUSTNESS_SCHEMA = "seaopt/robustness/3"
@@ -112,7 +122,18 @@ class Certificate(Result, Worded):
     constrained : ConstrainedRuns or None
         Of predictive control: runs with its limits active; all else is of its linear region.
     place : (str, float) or None
-        Of a schedule, its variable and the value at which it stands still.
+        Of one of a schedule's `places`: the variable and the value at which it stands still.
+    schedule : ScheduledController or None
+        What was certified, where it is a schedule: `controller` is then that of its first point, and `plants` and
+        `worst` are at each plant's worst place.
+    places : tuple of Certificate
+        Of the law frozen at the schedule's points and between them, ascending.
+    stretches : tuple of StretchBound
+        What is proved between neighbouring places.
+    sweeps : mapping of name to tuple of Sweep
+        Of each plant that has the schedule's variable.
+    motions : mapping of name to Motion
+        Of each plant that moves it.
     remarks : tuple of str
         What is found once, one sentence each: a delay of the fit that the controller does not count on; with friction,
         the bandwidth at amplitudes of use.
@@ -124,13 +145,13 @@ class Certificate(Result, Worded):
 
     requirements: tuple[Requirement, ...]
     plants: Mapping[str, LoopFigures]
-    margins: Mapping[str, PlantMargins]
     worst: Mapping[str, Worst]
     monte_carlo: MonteCarlo
     controller: Controller
     models: Plants
     parameters: ParameterSet
     varied: tuple[Varied, ...] = ()
+    margins: Mapping[str, PlantMargins] = field(default_factory=dict[str, PlantMargins])
     simulated: Simulated | None = None
     steps: Verification | str | None = None
     cycles: Mapping[str, tuple[FoundCycle, ...]] = field(default_factory=dict[str, tuple[FoundCycle, ...]])
@@ -143,6 +164,11 @@ class Certificate(Result, Worded):
     logs: tuple[LogVerdict, ...] = ()
     constrained: ConstrainedRuns | None = None
     place: tuple[str, float] | None = None
+    schedule: ScheduledController | None = None
+    places: tuple[Certificate, ...] = ()
+    stretches: tuple[StretchBound, ...] = ()
+    sweeps: Mapping[str, tuple[Sweep, ...]] = field(default_factory=dict[str, tuple[Sweep, ...]])
+    motions: Mapping[str, Motion] = field(default_factory=dict[str, Motion])
     remarks: tuple[str, ...] = ()
     drawn_ms: Mapping[str, Float[np.ndarray, " n"]] = field(
         default_factory=dict[str, Float[np.ndarray, " n"]], repr=False
@@ -152,6 +178,26 @@ class Certificate(Result, Worded):
     def met(self) -> bool:
         """Whether every requirement is met."""
         return all(row.met for row in self.requirements)
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The values of a schedule's variable at `places`."""
+        return tuple(place.place[1] for place in self.places if place.place is not None)
+
+    @property
+    def fastest(self) -> float:
+        """The largest rate of a schedule's variable at which every plant keeps its judgement in a sweep; or zero."""
+        return find_common_rate(self.sweeps)
+
+    @property
+    def assumption(self) -> str:
+        """The assumption on the motion of a schedule's variable; empty of one law."""
+        return "" if self.schedule is None else state_assumption(self.schedule, self.sweeps)
+
+    @property
+    def proof(self) -> str:
+        """The statement that is proved between a schedule's points, or where none is; empty of one law."""
+        return "" if self.schedule is None else state_proof(self.schedule, self.stretches)
 
     @property
     def linear_models(self) -> dict[str, Plant]:
@@ -201,6 +247,8 @@ class Certificate(Result, Worded):
         >>> coarse.passed, len(coarse.simulated.verification.rows)
         (True, 7)
         """
+        if self.schedule is not None:
+            raise ControlError("a schedule is simulated by certify alone; give certify sensors and command_step")
         if not self.models:
             raise ControlError("nothing can be simulated without a model; design the controller on one")
         simulated = run_simulations(
@@ -242,18 +290,61 @@ class Certificate(Result, Worded):
 
     @classmethod
     def from_dict(
-        cls, content: Mapping[str, Any], controller: Controller, models: Plants, parameters: ParameterSet
+        cls,
+        content: Mapping[str, Any],
+        law: Controller | ScheduledController,
+        plants: Plants,
+        parameters: Source,
+        *,
+        ranges: Ranges | None = None,
+        others: ParameterSet | None = None,
     ) -> Certificate:
-        """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated. Raises
-        FileError: a field is missing or malformed, it was edited or written by hand, or nothing is required in it.
+        """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated.
+
+        Arguments are those of `certify`; of predictive control `law` is `linear_controller` of it. Raises FileError: a
+        field is missing or malformed, it was edited or written by hand, or nothing is required in it.
         """
         from seaopt.robustness.certificate import stored  # deferred: it reads these
 
-        return stored.build_certificate(stored.read_certificate(content), content, controller, models, parameters)
+        posed = pose(law, plants, parameters, ranges or {}, others or ParameterSet())
+        return stored.build_certificate(content, law, posed)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of robustness.json (schema seaopt/robustness/3), with its digest."""
-        return seal({"schema": ROBUSTNESS_SCHEMA} | self.list_content() | {"schedule": None})
+        if self.schedule is None:
+            return seal({"schema": ROBUSTNESS_SCHEMA} | self.list_content() | {"schedule": None})
+        over = self.schedule.over
+        written = [
+            {"place": {over: value}} | place.list_content()
+            for value, place in zip(self.values, self.places, strict=True)
+        ]
+        return seal(
+            {
+                "schema": ROBUSTNESS_SCHEMA,
+                "met": self.met,
+                "passed": self.met,
+                "requirements": to_content(self.requirements),
+                "plants": _take_worst(written, "plants", lambda plant: plant["worst"]["severity"]),
+                "friction": _take_worst(written, "friction", _rank_friction),
+                "monte_carlo": to_content(self.monte_carlo),
+                "passivity": None,
+                "simulation": None,
+                "remarks": list(self.remarks),
+                "notes": list(self.notes),
+                "schedule": {
+                    "over": over,
+                    "unit": self.schedule.unit,
+                    "places": written,
+                    "stretches": to_content(self.stretches),
+                    "sweeps": to_content(self.sweeps),
+                    "motions": to_content(self.motions),
+                    "fastest_rate": self.fastest,
+                    "rate_unit": name_rate_unit(self.schedule),
+                    "proof": self.proof,
+                    "assumption": self.assumption,
+                },
+            }
+        )
 
     def list_content(self) -> dict[str, Any]:
         """Return what a file has of the certificate of one law."""
@@ -283,8 +374,23 @@ class Certificate(Result, Worded):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks besides the requirements, one sentence each."""
+        """Remarks besides the requirements, one sentence each; of a schedule those of its places, else of its points,
+        among them.
+        """
+        if self.schedule is not None:
+            return (*self.remarks, *self._list_schedule_notes(self.schedule))
         return (*(() if self.constrained is None else self.constrained.notes), *self._list_notes())
+
+    def _list_schedule_notes(self, schedule: ScheduledController) -> Iterator[str]:
+        unit, over = name_rate_unit(schedule), schedule.over
+        yield from (self.proof, self.assumption)
+        yield from (f"{name}: {describe_sweeps(sweeps, unit)}" for name, sweeps in self.sweeps.items())
+        yield from (f"{name}: {describe_motion(motion, over, unit)}" for name, motion in self.motions.items())
+        said = dict(zip(self.values, (place.notes for place in self.places), strict=True))
+        shared = [note for note in next(iter(said.values())) if all(note in notes for notes in said.values())]
+        yield from shared
+        for value in schedule.points:
+            yield from (f"{over} = {value:g}: {note}" for note in said[value] if note not in shared)
 
     def _list_notes(self) -> Iterator[str]:
         if self.controller.structure == CUSTOM and self.constrained is None:
@@ -371,3 +477,25 @@ class Certificate(Result, Worded):
         if np.count_nonzero(steepest - flattest) > 1:
             return ("no simulated step ends in a limit cycle, and with several frictions none can be predicted",)
         return ("no limit cycle is predicted, and no simulated step ends in one",)
+
+
+def _take_worst(
+    written: Sequence[Mapping[str, Any]], key: str, rank: Callable[[Mapping[str, Any]], Any]
+) -> dict[str, Any]:
+    """Return what the places have under a key, by plant: at its worst place, and which that is."""
+    worst: dict[str, Any] = {}
+    for name in dict.fromkeys(name for each in written for name in each[key]):
+        at = max((each for each in written if name in each[key]), key=lambda each: rank(each[key][name]))
+        worst[name] = {"place": at["place"], **at[key][name]}
+    return worst
+
+
+def _rank_friction(found: Mapping[str, Any]) -> tuple[bool, float]:
+    """Return how bad a place's friction is: first whether it is not shown to be harmless, then the least
+    slope that is, at the nominal parameters and at draws.
+    """
+    drawn = found.get("draws")
+    slopes = [] if drawn is None else [drawn["least_slope"]]
+    if "slopes" in found:  # as `FrictionMargin.least_slope`
+        slopes.append(min((slope for slope in found["slopes"] if slope > 0.0), default=0.0))
+    return not found["sector_stable"], -min(slopes, default=np.inf)

@@ -7,18 +7,17 @@ and with failures the bound is Clopper's and Pearson's. Draws are made and measu
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from types import NoneType
-from typing import Any, TypedDict, Unpack, overload
+from typing import Any
 
 import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.control import Controller, ForceMPC, ScheduledController
-from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor
@@ -33,28 +32,22 @@ from seaopt.robustness.certificate.cases import (
     CONFIDENCE,
     Cases,
     CertifyOptions,
+    Check,
     Subject,
     Survey,
     ask,
     count_seconds,
     digest_laws,
-    pose_cases,
+    pose,
 )
 from seaopt.robustness.certificate.certificate import NO_MODEL, Certificate
 from seaopt.robustness.certificate.compensation import COMPENSATION
 from seaopt.robustness.certificate.constrained import CONSTRAINED, linear_controller
 from seaopt.robustness.certificate.friction import FRICTION
 from seaopt.robustness.certificate.impedance import IMPEDANCE
-from seaopt.robustness.certificate.limits import LOGS, MEASURED, NOMINAL, measured_requirements
+from seaopt.robustness.certificate.limits import LOGS, MEASURED, NOMINAL
 from seaopt.robustness.certificate.measured_draws import DRAWS
-from seaopt.robustness.certificate.requirement import Requirement
-from seaopt.robustness.certificate.scheduled import (
-    JOINT_DRAWS,
-    STRETCHES,
-    SWEEPS,
-    ScheduleCertificate,
-    pose_places,
-)
+from seaopt.robustness.certificate.scheduled import JOINT_DRAWS, STRETCHES, SWEEPS
 from seaopt.robustness.certificate.simulated import SIMULATIONS, STEPS
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.verification.verification import check_sensors
@@ -64,36 +57,6 @@ SCHEDULE_CHECKS = (STRETCHES, JOINT_DRAWS, SWEEPS)  # of a schedule as a whole, 
 CERTIFICATE_STREAM = 0x5EA  # the certificate's own stream of random numbers, whatever the seed
 
 
-class CertifyKeywords(TypedDict, total=False):
-    """The keywords of `certify`, for type checkers: which certificate it returns is up to its subject."""
-
-    ranges: Ranges | None
-    others: ParameterSet | None
-    samples: int
-    seed: int
-    confidence: float
-    max_failure_probability: float | None
-    min_friction_margin: float | None
-    min_rate: float | None
-    runs: int
-    bound_tolerance: float
-    bounds: Budget | None
-    simulations: bool
-    sensors: Sensors | None
-    command_step: float
-    measured: Mapping[str, MeasuredResponse] | None
-    executor: Executor | None
-    progress: Progress
-
-
-@overload
-def certify(
-    subject: ScheduledController, plants: Plants, parameters: Source, **options: Unpack[CertifyKeywords]
-) -> ScheduleCertificate: ...
-@overload
-def certify(
-    subject: Controller | ForceMPC, plants: Plants, parameters: Source, **options: Unpack[CertifyKeywords]
-) -> Certificate: ...
 def certify(
     subject: Subject,
     plants: Plants,
@@ -116,7 +79,7 @@ def certify(
     measured: Mapping[str, MeasuredResponse] | None = None,
     executor: Executor | None = None,
     progress: Progress = ignore,
-) -> Certificate | ScheduleCertificate:
+) -> Certificate:
     """Check a law against plants: at the nominal parameters, over draws, and simulated on the nonlinear plants.
 
     Everything is computed from the law's transfer functions; every loop is closed with the current that the law
@@ -185,7 +148,7 @@ def certify(
 
     Returns
     -------
-    Certificate, or ScheduleCertificate of a schedule
+    Certificate
         A draw fails if a plant is unstable there, or breaks the specification's Ms or Mt.
 
     Raises
@@ -240,27 +203,28 @@ def certify(
         _check_responses(plants, measured or {})
     else:
         check_sensors(sensors, law, {"design": law.design[0], **plants})
-    posing: dict[str, Any] = {
-        "plants": plants, "parameters": parameters, "ranges": ranges or {}, "others": others or ParameterSet(),
-        "bounds": bounds,
-    }  # fmt: skip
-    pose = partial(
+    posed = pose(
+        subject if isinstance(subject, ScheduledController) else law,
+        plants,
+        parameters,
+        ranges or {},
+        others or ParameterSet(),
+        bounds,
+    )
+    make = partial(
         Survey,
         subject=subject,
         source=parameters,
+        others=others or ParameterSet(),
         options=options,
         simulations=simulations and not isinstance(subject, ForceMPC),
         sensors=sensors,
-        measured=measured or {},
         executor=executor,
     )
+    surveys = _list_surveys(subject, posed, make, options)
     if isinstance(subject, ScheduledController):
-        rows = _require_responses(subject, others, parameters, measured or {})
-        surveys = _list_surveys(subject, pose_places(subject, **posing), partial(pose, measured={}))
-        return _certify_schedule(subject, surveys, rows, progress)
-    cases, rng = pose_cases(law, **posing), np.random.default_rng([seed, CERTIFICATE_STREAM, digest_laws(law)])
-    survey = pose(shared=Shared(cases), drawing=rng, rng=rng, steps=bool(cases.models))
-    certificate = _certify_cases(survey, progress)
+        return _certify_schedule(replace(surveys[-1], place=None, measured=measured or {}, places=surveys), progress)
+    certificate = _certify_cases(replace(surveys[0], measured=measured or {}), CHECKS, progress)
     draws = certificate.monte_carlo
     progress(f"{draws.samples} draws, {format_count(draws.failures, 'failure')}", 1.0)
     return certificate
@@ -291,9 +255,58 @@ def _check_responses(plants: Plants, measured: Mapping[str, MeasuredResponse]) -
         )
 
 
-def _certify_cases(survey: Survey, progress: Progress) -> Certificate:
-    """Ask each check that applies to the cases of one law."""
-    cases, evidence = survey.cases, ask(CHECKS, survey, progress)
+def _list_surveys(
+    subject: Subject, posed: Mapping[float | None, Cases], make: Callable[..., Survey], options: CertifyOptions
+) -> list[Survey]:
+    """Return what is to be measured of a law, or at each place of a schedule. Points are simulated where the design
+    plant holds the variable: a law that is frozen is not what runs on one that moves it.
+    """
+    if not isinstance(subject, ScheduledController):
+        (cases,) = posed.values()
+        rng = np.random.default_rng([options.seed, CERTIFICATE_STREAM, digest_laws(cases.controller)])
+        return [make(shared=Shared(cases), drawing=rng, rng=rng, steps=bool(cases.models))]
+    drawing = np.random.default_rng([options.seed, digest_laws(*subject.controllers)])
+    held = subject.over not in subject.design[0].states
+    return [
+        make(
+            shared=Shared(cases),
+            options=replace(options, samples=-(-options.samples // len(posed))),
+            drawing=drawing,
+            rng=rng,
+            place=(subject.over, value),
+            point=value in subject.points,
+            steps=held and value in subject.points,
+        )
+        for (value, cases), rng in zip(posed.items(), drawing.spawn(len(posed)), strict=True)
+        if value is not None
+    ]
+
+
+def _certify_schedule(whole: Survey, progress: Progress) -> Certificate:
+    """Certify a schedule at each of its places, between them, and where responses were measured."""
+    surveys, schedule, of_responses = whole.places, whole.schedule, ask((MEASURED,), whole, ignore)
+    seconds = [count_seconds(CHECKS, survey) for survey in surveys]
+    *parts, joining = divide(progress, *seconds, count_seconds(SCHEDULE_CHECKS, whole))
+    places = tuple(
+        _certify_cases(survey, CHECKS, prefix(part, f"{schedule.over} = {survey.place[1]:.4g}"))
+        for survey, part in zip(surveys, parts, strict=True)
+        if survey.place is not None
+    )
+    joint = _certify_cases(replace(whole, found={"places": places}), SCHEDULE_CHECKS, joining)
+    progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
+    of_places = (row for place in places for row in place.requirements)
+    return replace(
+        joint,
+        controller=schedule.controllers[0],
+        schedule=schedule,
+        requirements=(*of_places, *of_responses.requirements, *joint.requirements),
+        remarks=of_responses.remarks,
+    )
+
+
+def _certify_cases(survey: Survey, checks: Sequence[Check], progress: Progress) -> Certificate:
+    """Ask each check that applies to the cases of one law, or of a schedule as a whole."""
+    cases, evidence = survey.cases, ask(checks, survey, progress)
     none: dict[str, Any] = {"plants": {}, "margins": {}, "steps": None if cases.models else NO_MODEL}
     return Certificate(
         requirements=tuple(evidence.requirements),
@@ -304,73 +317,4 @@ def _certify_cases(survey: Survey, progress: Progress) -> Certificate:
         place=survey.place,
         remarks=evidence.remarks,
         **none | dict(evidence.fields),
-    )
-
-
-def _list_surveys(
-    schedule: ScheduledController, places: Mapping[float, Cases], pose: partial[Survey]
-) -> dict[float, Survey]:
-    """Return what is to be measured at each place of a schedule. Points are simulated where the design plant holds the
-    variable: a law that is frozen is not what runs on one that moves it.
-    """
-    options = pose.keywords["options"]
-    drawing = np.random.default_rng([options.seed, digest_laws(*schedule.controllers)])
-    options = replace(options, samples=-(-options.samples // len(places)))
-    held = schedule.over not in schedule.design[0].states
-    return {
-        value: pose(
-            shared=Shared(cases),
-            options=options,
-            drawing=drawing,
-            rng=rng,
-            place=(schedule.over, value),
-            point=value in schedule.points,
-            steps=held and value in schedule.points,
-        )
-        for (value, cases), rng in zip(places.items(), drawing.spawn(len(places)), strict=True)
-    }
-
-
-def _require_responses(
-    schedule: ScheduledController,
-    others: ParameterSet | None,
-    parameters: Source,
-    measured: Mapping[str, MeasuredResponse],
-) -> list[Requirement]:
-    """Return the limits on measured responses, each with the law at the value at which it was taken."""
-    fitted = parameters.parameters if isinstance(parameters, Fit) else parameters
-    values, over = (others or ParameterSet()).with_parameters(*fitted.values()), schedule.over
-    rows: list[Requirement] = []
-    for name, response in measured.items():
-        place, points = find_response_place(over, name, response, values), schedule.points
-        if not points[0] <= place <= points[-1]:
-            raise ControlError(
-                f"measured: {name} was taken at {over} = {place:g}, outside the points; leave it out, or give points "
-                "that reach there"
-            )
-        of_response = measured_requirements(schedule.at(place), name, response)
-        rows += [replace(row, place=(over, place)) for row in of_response]
-    return rows
-
-
-def _certify_schedule(
-    schedule: ScheduledController,
-    surveys: Mapping[float, Survey],
-    of_responses: Sequence[Requirement],
-    progress: Progress,
-) -> ScheduleCertificate:
-    """Certify a schedule at each of its places, and between them."""
-    *_, last = surveys.values()
-    whole = replace(last, place=None, places=surveys)
-    seconds = [count_seconds(CHECKS, survey) for survey in surveys.values()]
-    *parts, joining = divide(progress, *seconds, count_seconds(SCHEDULE_CHECKS, whole))
-    places = tuple(
-        _certify_cases(survey, prefix(part, f"{schedule.over} = {value:.4g}"))
-        for (value, survey), part in zip(surveys.items(), parts, strict=True)
-    )
-    evidence = ask(SCHEDULE_CHECKS, replace(whole, found={"places": places}), joining)
-    progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
-    of_places = (row for place in places for row in place.requirements)
-    return ScheduleCertificate(
-        schedule=schedule, requirements=(*of_places, *of_responses, *evidence.requirements), **evidence.fields
     )

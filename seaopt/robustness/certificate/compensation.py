@@ -154,28 +154,24 @@ Measure = Callable[[Controller, Plant, ParameterSet, Draw], EigenvalueCase]
 
 def find_gravity_cases(survey: Survey) -> dict[str, EigenvalueCase]:
     """Return how fast each plant's link runs away at most with its weight compensated; none of held links."""
-    compensation = survey.cases.controller.compensation
+    compensation, models = survey.cases.controller.compensation, survey.cases.models
     term = None if compensation is None else compensation.gravity
-    if term is None:
-        return {}
-    models = survey.cases.models
-    moving = [name for name, model in models.items() if model.port is not None and term.reads in model.outputs]
+    moving = [name for name, model in models.items() if model.port is not None and term and term.reads in model.outputs]
     return _find_worst(measure_gravity, survey, moving)
 
 
 def find_ripple_cases(survey: Survey) -> dict[str, EigenvalueCase]:
     """Return the largest eigenvalue of every plant's loop over the slopes of a ripple's compensation; empty without."""
     compensation = survey.cases.controller.compensation
-    if compensation is None or compensation.ripple is None:
-        return {}
-    return _find_worst(measure_ripple, survey, survey.cases.models)
+    ripples = compensation is not None and compensation.ripple is not None
+    return _find_worst(measure_ripple, survey, list(survey.cases.models) if ripples else ())
 
 
 def _find_worst(measure: Measure, survey: Survey, names: Collection[str]) -> dict[str, EigenvalueCase]:
     """Return the worst case of some plants, among the nominal parameters and draws."""
-    draws = [{}, *survey.cases.unknown.list_draws(min(survey.samples, EIGENVALUE_DRAWS), survey.rng)]
-    judge = partial(_measure_draws, measure)
-    return {name: choose_worst(judge_draws(judge, survey, name, draws)) for name in names}
+    judges = dict.fromkeys(names, partial(_measure_draws, measure))
+    made = judge_draws(survey, EIGENVALUE_DRAWS, judges, nominal=[{}])
+    return {name: choose_worst(case for _, case in pairs) for name, pairs in made.items()}
 
 
 def _measure_draws(measure: Measure, cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[EigenvalueCase]:

@@ -60,6 +60,7 @@ from seaopt.robustness.verification.judgement import LINE_SIGMAS, find_noise_flo
 from seaopt.robustness.verification.linear import LinearView, view_loop
 from seaopt.robustness.verification.oscillation import Oscillation, Signal, measure_swing
 from seaopt.robustness.verification.playback import Stage
+from seaopt.robustness.verification.verification import make_stages
 from seaopt.units import LINEAR
 
 CONSTRAINED_STREAM = 0x3C  # the runs' own stream of random numbers, whatever the seed
@@ -236,34 +237,24 @@ class _RunDraw:
 
 
 @record(eq=False)
-class _Bench:
-    """The parts that every run shares; `law` is the same in its linear region, `tolerance` is of bounds."""
+class _Case:
+    """A run on one plant: the stage has the law in its linear region; `tolerance` is of bounds."""
 
     mpc: ForceMPC
-    law: Controller
+    stage: Stage
     tolerance: float
-    sensors: Sensors
-    command_step: float
+    values: ParameterSet
+    drawn: _RunDraw
 
     @property
-    def ideal(self) -> _Bench:
+    def ideal(self) -> _Case:
         """The same with an ideal sensor and amplifier."""
-        return replace(self, sensors=Sensors(), command_step=0.0)
+        return replace(self, stage=replace(self.stage, sensors=Sensors(), command_step=0.0))
 
     @property
     def is_ideal(self) -> bool:
         """Whether sensor and amplifier add nothing of their own."""
-        return self.sensors == Sensors() and not self.command_step
-
-
-@record(eq=False)
-class _Case:
-    """A run on one plant."""
-
-    bench: _Bench
-    plant: Plant
-    values: ParameterSet
-    drawn: _RunDraw
+        return self.stage.sensors == Sensors() and not self.stage.command_step
 
     def play(self) -> _Outcome:
         """Simulate the run, and judge it."""
@@ -277,14 +268,14 @@ class _Case:
         )
 
     def _judge(self, steps: list[MPCStep]) -> _Outcome:
-        mpc = self.bench.mpc
+        mpc = self.mpc
         try:
             run = self._simulate(steps)
         except SeaoptError as error:
             return _Outcome(kind=DIVERGED, text=str(error))
         violation, signal = self._find_violation(run)
         kind, text = self._judge_force(run, np.array([step.target_N for step in steps]))
-        if not kind and violation > self.bench.tolerance:
+        if not kind and violation > self.tolerance:
             kind, text = OVER_BOUND, f"{signal} leaves its bounds by {violation:.1%} of half their width"
         ring, lasting = self._find_ring(run)
         if not kind and lasting:
@@ -298,9 +289,9 @@ class _Case:
         """Return the samples of the run, and add each step of the law to `steps`. An outer loop is given what it makes
         the reference of, an x_0 or a force, and asks for the force of one sample: with it there is no preview.
         """
-        mpc = self.bench.mpc
+        mpc, stage = self.mpc, self.stage
         outer = mpc.outer
-        moved = outer is not None and outer.position in self.plant.outputs
+        moved = outer is not None and outer.position in stage.plant.outputs
 
         def law(state: Any, r: Any, y: Any) -> tuple[float, Any]:
             plan, kept = state
@@ -315,15 +306,15 @@ class _Case:
         return close_loop(
             law,
             (mpc.start, FIRST),
-            self.plant,
+            stage.plant,
             self.values,
             self.drawn.reference,
             measured=(mpc.measured, outer.position) if outer is not None and moved else mpc.measured,
             sample_time_s=mpc.sample_time_s,
             delay_samples=mpc.compute_delay_samples,
             preview_samples=mpc.spec.preview_samples if outer is None else 0,
-            sensors=self.bench.sensors,
-            command_step=self.bench.command_step,
+            sensors=stage.sensors,
+            command_step=stage.command_step,
             command_limit=mpc.command_limit,
             disturbance_A=self.drawn.disturbance,
             seed=self.drawn.seed,
@@ -331,7 +322,7 @@ class _Case:
 
     def _judge_force(self, run: ForceRun, target: Signal) -> tuple[str, str]:
         """Return what is wrong with the force of a run, a kind and a sentence; "" twice where nothing is."""
-        mpc = self.bench.mpc
+        mpc = self.mpc
         limit = abs(mpc.static_gain) * mpc.command_limit
         _, phase, lasting = _count_samples(mpc)
         peak = float(np.max(np.abs(run.force)))
@@ -341,7 +332,7 @@ class _Case:
         first, second = np.max(off[-lasting : -lasting // 2]), np.max(off[-lasting // 2 :])
         if second > GROWTH * first + SETTLED * limit:
             return DIVERGED, f"the error grows to {second:.4g} {run.unit} over the last phase"
-        if self.plant.moves:
+        if self.stage.plant.moves:
             return "", ""
         last = max(round(LAST_SHARE * phase), 1)
         end_of_step = run.time.size - lasting - mpc.spec.preview_samples  # before its end the next phase is known
@@ -356,16 +347,14 @@ class _Case:
         rounding makes comes and goes, so that half of the runs that ring look as if they died out. What dies out is
         therefore no fault only where the same run on ideal devices has as much of it.
         """
-        bench = self.bench
-        stage = Stage(controller=bench.law, plant=self.plant, sensors=bench.sensors, command_step=bench.command_step)
-        view = view_loop(stage, self.plant, self.values)
+        view = view_loop(self.stage, self.stage.plant, self.values)
         swing = self._measure_ring(run, view)
         fading = not (swing.sustained or swing.growing)
-        if fading and bench.is_ideal:
+        if fading and self.is_ideal:
             return 0.0, ""
-        floor = find_noise_floor(stage, float(np.max(np.abs(run.force))))
+        floor = find_noise_floor(self.stage, float(np.max(np.abs(run.force))))
         if not view.instability:
-            floor = max(floor, LINE_SIGMAS * view.force_std(SLOWEST * bench.mpc.spec.bandwidth_hz))
+            floor = max(floor, LINE_SIGMAS * view.force_std(SLOWEST * self.mpc.spec.bandwidth_hz))
         if swing.amplitude <= floor:
             return swing.peak, ""
         if fading and not self._rings_by_devices(swing.amplitude, view):
@@ -376,7 +365,7 @@ class _Case:
     def _rings_by_devices(self, amplitude: float, view: LinearView) -> bool:
         """Tell whether most of what swings is gone with ideal devices, so that it is no transient of the loop."""
         try:
-            ideal = replace(self, bench=self.bench.ideal)._simulate([])
+            ideal = self.ideal._simulate([])
         except SeaoptError:
             return False
         return self._measure_ring(ideal, view).amplitude < 0.5 * amplitude
@@ -385,7 +374,7 @@ class _Case:
         """Return what swings at the end of a run; without the slow modes of a link that an outer loop makes swing, of
         which the ends of a window make fast ones.
         """
-        mpc, lowest_hz = self.bench.mpc, SLOWEST * self.bench.mpc.spec.bandwidth_hz
+        mpc, lowest_hz = self.mpc, SLOWEST * self.mpc.spec.bandwidth_hz
         judged = round(JUDGED_PERIODS / mpc.spec.bandwidth_hz * mpc.spec.sample_rate_hz)
         force = run.force[-judged:]
         if mpc.outer is not None:
@@ -399,7 +388,7 @@ class _Case:
 
     def _find_violation(self, run: ForceRun) -> tuple[float, str]:
         """Return by how much a bounded signal leaves its bounds at most, over half their width, and which it is."""
-        mpc, plant = self.bench.mpc, self.plant
+        mpc, plant = self.mpc, self.stage.plant
         worst, signal = 0.0, ""
         completed = plant.complete(self.values)
         delay_s = float(find_delay(plant, read_conditions(plant, self.values)))
@@ -453,8 +442,9 @@ def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
         draw = {name: float(column[k]) for name, column in drawn.items() if name not in placed}
         reference, disturbance = _draw_references(mpc, rng)
         parts.append(_RunDraw(draw=draw, seed=seed + k, reference=reference, disturbance=disturbance))
-    bench = _Bench(mpc=mpc, law=law, tolerance=tolerance, sensors=sensors, command_step=command_step)
-    played = map_ordered(partial(_play_run, Shared((bench, dict(plants), unknown.nominal))), parts, survey.executor)
+    stages = make_stages(law, plants, sensors, command_step)
+    shared = Shared((mpc, stages, tolerance, unknown.nominal))
+    played = map_ordered(partial(_play_run, shared), parts, survey.executor)
     kinds: list[str] = []
     failed_run, outcomes = dict[str, Any](), list[_Outcome]()
     for k in count_off(range(runs), "limits active, run", progress):
@@ -463,9 +453,9 @@ def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
         failed = next((name for name, outcome in of_plants.items() if outcome.kind), None)
         kinds.append("" if failed is None else of_plants[failed].kind)
         if failed is not None and not failed_run:
-            plant, draw, outcome = plants[failed], parts[k].draw, of_plants[failed]
-            used = {key: draw[key] for key in draw if key in place_values(plant, unknown.nominal, draw)}
-            case = _Case(bench=bench, plant=plant, values=place_values(plant, unknown.nominal, used), drawn=parts[k])
+            stage, draw, outcome = stages[failed], parts[k].draw, of_plants[failed]
+            has = place_values(stage.plant, unknown.nominal, draw)
+            used, case = {key: draw[key] for key in draw if key in has}, _place_run(shared.value, stage, parts[k])
             remedy = _find_remedy(case, failed, unknown.nominal, used, outcome)
             failed_run.update(plant=failed, run=str(k + 1), text=outcome.text, parameters=used, remedy=remedy)
     failures, steps = sum(map(bool, kinds)), max(sum(outcome.steps for outcome in outcomes), 1)
@@ -516,18 +506,24 @@ def _count_samples(mpc: ForceMPC) -> tuple[int, int, int]:
     return round(REST_S * rate), round(phase_s * rate), round((phase_s + JUDGED_PERIODS / band) * rate)
 
 
-def _play_run(shared: Shared[tuple[_Bench, dict[str, Plant], ParameterSet]], run: _RunDraw) -> list[_Outcome]:
+_Staged = tuple[ForceMPC, dict[str, Stage], float, ParameterSet]
+
+
+def _place_run(staged: _Staged, stage: Stage, run: _RunDraw) -> _Case:
+    """Return a run on one stage, at what was drawn."""
+    mpc, _, tolerance, nominal = staged
+    values = place_values(stage.plant, nominal, run.draw)
+    return _Case(mpc=mpc, stage=stage, tolerance=tolerance, values=values, drawn=run)
+
+
+def _play_run(shared: Shared[_Staged], run: _RunDraw) -> list[_Outcome]:
     """Simulate one run on every plant, and judge it."""
-    bench, plants, nominal = shared.value
-    return [
-        _Case(bench=bench, plant=plant, values=place_values(plant, nominal, run.draw), drawn=run).play()
-        for plant in plants.values()
-    ]
+    return [_place_run(shared.value, stage, run).play() for stage in shared.value[1].values()]
 
 
 def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[str, float], failed: _Outcome) -> str:
     """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
-    bench, plant, mpc = case.bench, case.plant, case.bench.mpc
+    mpc, plant = case.mpc, case.stage.plant
     over_bound = failed.kind == OVER_BOUND
 
     def fails(values: ParameterSet) -> bool:
@@ -536,13 +532,13 @@ def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[st
     if failed.late:
         return f"a larger max_iterations in [mpc]: {format_count(failed.late, 'sample')} of that run had no plan"
     # Of a bound the room that it needs is named.
-    if not over_bound and not bench.is_ideal and not replace(case, bench=bench.ideal).play().kind:
+    if not over_bound and not case.is_ideal and not case.ideal.play().kind:
         return (
             "finer sensors of less offset and more range, a finer command_step, or a lower bandwidth_hz: with ideal "
             "ones that run passes"
         )
     design, values = mpc.design
-    if (of_design := replace(case, plant=design, values=values).play()).kind:
+    if (of_design := replace(case, stage=replace(case.stage, plant=design), values=values).play()).kind:
         return f"{_name_obstacle(mpc, of_design)}: the run fails on the design plant with its own parameters too"
     room = f", or leave {failed.signal} more room by bound_tolerance" if over_bound else ""
     at_nominal = place_values(plant, nominal, {})

@@ -25,7 +25,7 @@ from seaopt.plants.friction import has_friction
 from seaopt.progress import Progress
 from seaopt.records import record
 from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
-from seaopt.robustness.certificate.measured_draws import judge_draws, select_own
+from seaopt.robustness.certificate.measured_draws import judge_draws
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, DrawnAt, Requirement, require_at_least
 
 MARGIN_DRAWS = 100  # at most so many are looked at
@@ -90,23 +90,16 @@ def find_margins_at_draws(survey: Survey, nominal: Mapping[str, FrictionMargin])
 def draw_margins(
     survey: Survey, judges: Mapping[str, Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Margin]]]
 ) -> dict[str, MarginDraws]:
-    """Return what plants' judgements make of draws; draws that do not differ in what a plant has are judged once."""
-    count, made = min(survey.samples, MARGIN_DRAWS), dict[str, MarginDraws]()
-    draws = survey.cases.unknown.list_draws(count, survey.rng) if count and judges else []
-    for name, judge in judges.items() if draws else ():
-        of_plant = select_own(survey.cases, name, draws)
-        distinct = {tuple(draw.items()): draw for draw in of_plant}
-        of_draw = dict(zip(distinct, judge_draws(judge, survey, name, list(distinct.values())), strict=True))
-        margins = [of_draw[tuple(draw.items())] for draw in of_plant]
-        slopes = [_take_slope(margin) for margin in margins]
-        least = int(np.argmin(slopes))
-        margin = margins[least]
+    """Return what plants' judgements make of draws."""
+    made: dict[str, MarginDraws] = {}
+    for name, pairs in judge_draws(survey, MARGIN_DRAWS, judges).items():
+        draw, margin = min(pairs, key=lambda pair: _take_slope(pair[1]))
         made[name] = MarginDraws(
-            samples=count,
-            shown=sum(each is None or each.shown for each in margins),
-            least_slope=slopes[least],
+            samples=len(pairs),
+            shown=sum(each is None or each.shown for _, each in pairs),
+            least_slope=_take_slope(margin),
             factor=np.inf if margin is None else margin.factor,
-            parameters=of_plant[least],
+            parameters=dict(draw),
         )
     return made
 

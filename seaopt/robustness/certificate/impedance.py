@@ -20,7 +20,7 @@ from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
-from seaopt.progress import Progress, count_off
+from seaopt.progress import Progress
 from seaopt.records import record
 from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
 from seaopt.robustness.certificate.measured_draws import judge_draws
@@ -149,21 +149,21 @@ def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
 
 
 def draw_impedance(survey: Survey, progress: Progress) -> ImpedanceDraws | None:
-    """Judge the impedance of a controller's outer loop at draws; None where it has none, or nothing is drawn."""
-    count, at = min(survey.samples, IMPEDANCE_DRAWS), survey.cases
-    if at.controller.outer is None or not count:
+    """Judge the impedance of a controller's outer loop at draws; None where nothing is drawn."""
+    name = _find_plant(survey.cases.controller, survey.cases.models)
+    progress("impedance, draws", 0.0)
+    pairs = judge_draws(survey, IMPEDANCE_DRAWS, {name: _judge_states}).get(name)
+    if pairs is None:
         return None
-    name, draws = _find_plant(at.controller, at.models), at.unknown.list_draws(count, survey.rng)
-    judged = judge_draws(_judge_states, survey, name, draws)
-    stable = passive = 0
-    least, worst = np.inf, dict[str, float]()
-    for draw in count_off(draws, "impedance, draw", progress):
-        rests, margin = next(judged)
-        stable += rests
-        passive += margin > 0.0
-        if margin < least:
-            least, worst = (margin, {key: value for key, value in draw.items() if key in at.models[name].parameters})
-    return ImpedanceDraws(samples=count, stable=stable, passive=passive, margin=float(least), parameters=worst)
+    draw, (_, margin) = min(pairs, key=lambda pair: pair[1][1])
+    own = survey.cases.models[name].parameters
+    return ImpedanceDraws(
+        samples=len(pairs),
+        stable=sum(rests for _, (rests, _) in pairs),
+        passive=sum(margin > 0.0 for _, (_, margin) in pairs),
+        margin=margin,
+        parameters={key: value for key, value in draw.items() if key in own},
+    )
 
 
 def _judge_states(cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[tuple[bool, float]]:

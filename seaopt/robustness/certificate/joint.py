@@ -36,10 +36,9 @@ from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.measured_draws import measure_draws, search_worst
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
-from seaopt.robustness.certificate.scheduled import ScheduleCertificate
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
-from seaopt.robustness.uncertainty.worst import Worst, place_values
+from seaopt.robustness.uncertainty.worst import place_values
 
 MOST_ROUNDS = 6
 TUNING, CERTIFYING = 1.0, 2.0  # of the time of a round
@@ -59,7 +58,7 @@ class Round:
     plants : int
         Number of plants on which the tuner kept its limits, the design plant included.
     controller : Controller or ScheduledController
-    certificate : Certificate, ScheduleCertificate or None
+    certificate : Certificate or None
         None if the controller misses its limits on those plants already.
     added : tuple of str
         Witnesses that the next round keeps its limits on too.
@@ -68,7 +67,7 @@ class Round:
     number: int
     plants: int
     controller: Controller | ScheduledController
-    certificate: Certificate | ScheduleCertificate | None
+    certificate: Certificate | None
     added: tuple[str, ...] = ()
 
 
@@ -84,7 +83,7 @@ class JointTuning(Result):
         few.
     controller : Controller or ScheduledController
         Of the last round.
-    certificate : Certificate, ScheduleCertificate or None
+    certificate : Certificate or None
         Of that controller; None if it is infeasible.
     rounds : tuple of Round
     robust_to : mapping of name to (plant, parameters) or MeasuredResponse
@@ -93,7 +92,7 @@ class JointTuning(Result):
 
     status: Literal["certified", "infeasible", "stuck", "rounds"]
     controller: Controller | ScheduledController
-    certificate: Certificate | ScheduleCertificate | None
+    certificate: Certificate | None
     rounds: tuple[Round, ...]
     robust_to: Witnesses
 
@@ -272,7 +271,7 @@ def breaks_at_draws(
 
 
 def _list_new_witnesses(
-    certificate: Certificate | ScheduleCertificate | None, tuned_on: Sequence[tuple[Plant, ParameterSet]], number: int
+    certificate: Certificate | None, tuned_on: Sequence[tuple[Plant, ParameterSet]], number: int
 ) -> dict[str, tuple[Plant, ParameterSet]]:
     """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need. Of
     friction it is the draw with the least margin, where that is not what is asked.
@@ -280,9 +279,9 @@ def _list_new_witnesses(
     if certificate is None or certificate.passed:
         return {}
     cases: dict[str, tuple[Plant, ParameterSet, Mapping[str, float]]] = {
-        name: (worst[0], worst[1], worst.parameters) for name, worst in find_worst(certificate).items()
+        name: (worst[0], worst[1], worst.parameters) for name, worst in certificate.worst.items()
     }
-    for each in list_certificates(certificate):
+    for each in certificate.places or (certificate,):
         least = each.controller.spec.level(MIN_FRICTION_MARGIN)
         for name, draws in each.friction_draws.items():
             if least is not None and draws.least_slope < least:
@@ -294,21 +293,6 @@ def _list_new_witnesses(
         for name, (plant, values, place) in cases.items()
         if not any(plant is other and _agree(values, at, place) for other, at in tuned_on)
     }
-
-
-def list_certificates(certificate: Certificate | ScheduleCertificate) -> tuple[Certificate, ...]:
-    """Return a certificate, or those of a schedule's places."""
-    return certificate.places if isinstance(certificate, ScheduleCertificate) else (certificate,)
-
-
-def find_worst(certificate: Certificate | ScheduleCertificate) -> dict[str, Worst]:
-    """Return the worst case of each plant, of a schedule over all of its places."""
-    found: dict[str, Worst] = {}
-    for each in list_certificates(certificate):
-        for name, worst in each.worst.items():
-            if name not in found or worst.severity > found[name].severity:
-                found[name] = worst
-    return found
 
 
 def _agree(values: ParameterSet, other_values: ParameterSet, names: Iterable[str]) -> bool:
@@ -323,7 +307,7 @@ def _list_cells(entry: Round) -> tuple[str, str, str, str]:
     """Return a row of the table of rounds."""
     if entry.certificate is None:
         return str(entry.number), str(entry.plants), "–", "limits not met on these plants"
-    name, worst = max(find_worst(entry.certificate).items(), key=lambda pair: pair[1].severity)
+    name, worst = max(entry.certificate.worst.items(), key=lambda pair: pair[1].severity)
     size = "unstable" if worst.severity >= UNSTABLE else f"{worst.severity:.4f}"
     failures, place = str(entry.certificate.monte_carlo.failures), format_values(worst.parameters, missing="nominal")
     return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {place}"

@@ -4,7 +4,7 @@ the logs of the fit.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,8 @@ from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY
 from seaopt.control.running.fed_back import close_terms
+from seaopt.control.scheduling.tuning import find_response_place
+from seaopt.errors import ControlError
 from seaopt.estimation import Experiment, Fit
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
@@ -44,6 +46,13 @@ from seaopt.robustness.verification.scenarios import STEP_SHARES
 PASSIVE = "passive_band_hz"
 LOG_SENSITIVITY = "log_sensitivity"
 NO_LOG = "no log of the fit is of a plant that is certified, so that none judges the law"
+SILENT = {
+    "lacks a signal": "log {0.experiment} does not judge the law: it has no {0.detail}",
+    "taken under feedback": "log {0.experiment} was taken under feedback: its input carries its noise, and it judges "
+    "no law",
+    "too weak": "log {0.experiment} says nothing of this loop: it is too short, or too weak",
+    "an error": "log {0.experiment} does not judge the law: {0.detail}",
+}
 LOG_SECONDS = 0.02  # that the logs of a fit take as a rule
 AMPLITUDES = 9  # looked at for the remark on bandwidth
 
@@ -77,14 +86,37 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
 
 
 def measure_responses(survey: Survey, _: Progress) -> Evidence:
-    """Judge the loop on every measured response; a law that was designed on one by all limits on the first."""
-    controller, measured = survey.cases.controller, survey.measured
-    rows: list[Requirement] = []
-    if controller.designs_on_response:
-        rows += measured_requirements(controller, *next(iter(measured.items())), "design plant")
-    for name, response in measured.items():
-        rows += measured_requirements(controller, name, response)
-    return Evidence(requirements=rows, remarks=tuple(_remark_measured(controller, measured)))
+    """Judge the loop on every measured response, of a schedule with the law where it was taken; a law that was designed
+    on one by all limits on the first.
+    """
+    rows, remarks = list[Requirement](), list[str]()
+    for name, response in survey.measured.items():
+        controller, place = _find_law(survey, name, response)
+        scopes: tuple[Scope, ...] = ("every plant",)
+        if controller.designs_on_response and not rows:
+            scopes = ("design plant", *scopes)
+        for scope in scopes:
+            of_response = measured_requirements(controller, name, response, scope)
+            rows += (replace(row, place=place) for row in of_response)
+        plant = controller.spec.see_response(response, controller.command)
+        remarks.append(str(measure_discs(plant, controller.law, controller.spec.bandwidth_hz)))
+    return Evidence(requirements=rows, remarks=tuple(remarks))
+
+
+def _find_law(survey: Survey, name: str, response: MeasuredResponse) -> tuple[Controller, tuple[str, float] | None]:
+    """Return the law that a response is of, and of a schedule the value at which it was taken."""
+    if not survey.places:
+        return survey.cases.controller, None
+    source, schedule = survey.source, survey.schedule
+    fitted = source.parameters if isinstance(source, Fit) else source
+    values, (first, *_, last) = survey.others.with_parameters(*fitted.values()), schedule.points
+    place = find_response_place(schedule.over, name, response, values)
+    if not first <= place <= last:
+        raise ControlError(
+            f"measured: {name} was taken at {schedule.over} = {place:g}, outside the points; leave it out, or give "
+            "points that reach there"
+        )
+    return schedule.at(place), (schedule.over, place)
 
 
 def judge_logs(survey: Survey, _: Progress) -> Evidence:
@@ -98,22 +130,21 @@ def judge_logs(survey: Survey, _: Progress) -> Evidence:
     if survey.place is not None:
         logs = [each for each in logs if np.isclose(_find_log_place(survey.place[0], fit, each), survey.place[1])]
     found = [judge_log(controller, fit, experiment, limit) for experiment in logs]
-    if fit.experiments and not logs and survey.place is None:
-        found.append(((), NO_LOG))
     verdicts = tuple(verdict for of_log, _ in found for verdict in of_log)
     rows = (
         require_at_most(
             LOG_SENSITIVITY,
-            verdict.ms_least,
+            each.ms_least,
             limit * (1.0 + GRACE),
-            plant=f"log:{verdict.experiment}",
-            text=verdict.text,
+            plant=f"log:{each.experiment}",
+            text=f"{each.samples}, {each.outcome} at {each.ms_hz:.3g} Hz, predicted {each.ms_predicted:.3g}",
         )
-        for verdict in verdicts
+        for each in verdicts
     )
-    return Evidence(
-        requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remark for _, remark in found if remark)
-    )
+    remarks = [SILENT[silent.why].format(silent) for _, silent in found if silent is not None]
+    if fit.experiments and not logs and survey.place is None:
+        remarks.append(NO_LOG)
+    return Evidence(requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remarks))
 
 
 def _find_log_place(over: str, fit: Fit, experiment: Experiment) -> float:
@@ -200,13 +231,6 @@ def _place_passive(row: Requirement, port: PortFigures, band: tuple[float, float
         return replace(row, text=text)
     remedy = BY_NAME[PASSIVE].remedy if port.held_stable else "the loop grows with its link held"
     return replace(row, text=text, remedy=remedy)
-
-
-def _remark_measured(controller: Controller, measured: Mapping[str, MeasuredResponse]) -> Iterator[str]:
-    """Yield on which measured points the law was judged, and under what assumptions."""
-    for response in measured.values():
-        plant = controller.spec.see_response(response, controller.command)
-        yield str(measure_discs(plant, controller.law, controller.spec.bandwidth_hz))
 
 
 def _remark_amplitude(cases: Cases, plant: Plant) -> tuple[str, ...]:

@@ -164,23 +164,28 @@ def _search_plant(cases: Shared[Cases], part: tuple[str, Points]) -> tuple[Worst
     return worst, bounded
 
 
-def select_own(cases: Cases, name: str, draws: Sequence[Draw]) -> list[dict[str, float]]:
-    """Return of draws what the model of a name has of them."""
-    model, nominal = cases.models[name], cases.unknown.nominal
-    names = [key for key in draws[0] if key in place_values(model, nominal, draws[0])] if draws else []
-    return [{key: draw[key] for key in names} for draw in draws]
-
-
 def judge_draws(
-    judge: Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Case]],
     survey: Survey,
-    name: str,
-    draws: Sequence[Draw],
-) -> Iterator[Case]:
-    """Yield what a judgement makes of every draw on the plant of a name, in order; it gets some draws at a time."""
-    parts = (draws[k : k + DRAWS_PER_PART] for k in range(0, len(draws), DRAWS_PER_PART))
-    for judged in map_ordered(partial(judge, survey.shared, name), parts, survey.executor):
-        yield from judged
+    most: int,
+    judges: Mapping[str, Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Case]]],
+    nominal: Sequence[Draw] = (),
+) -> dict[str, list[tuple[Draw, Case]]]:
+    """Return what the judgement of each plant makes of draws, the same for all, and of what is `nominal` before them:
+    pairs of what the plant has of a draw and of what is made of it. What does not differ in that is judged once.
+    """
+    count, models, unknown = min(survey.samples, most), survey.cases.models, survey.cases.unknown
+    draws = [*nominal, *(unknown.list_draws(count, survey.rng) if count and judges else ())]
+    made: dict[str, list[tuple[Draw, Case]]] = {}
+    for name, judge in judges.items() if draws else ():
+        has = place_values(models[name], unknown.nominal, draws[-1])
+        of_plant: list[Draw] = [{key: value for key, value in draw.items() if key in has} for draw in draws]
+        distinct = list({tuple(draw.items()): draw for draw in of_plant}.values())
+        parts = (distinct[k : k + DRAWS_PER_PART] for k in range(0, len(distinct), DRAWS_PER_PART))
+        judged = map_ordered(partial(judge, survey.shared, name), parts, survey.executor)
+        cases = zip(distinct, (case for part in judged for case in part), strict=True)
+        found = {tuple(draw.items()): case for draw, case in cases}
+        made[name] = [(draw, found[tuple(draw.items())]) for draw in of_plant]
+    return made
 
 
 def draw_requirements(

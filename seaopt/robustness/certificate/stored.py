@@ -21,7 +21,7 @@ from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.bounds.stretch import StretchBound
-from seaopt.robustness.certificate.cases import DESIGN_NAMES, Cases
+from seaopt.robustness.certificate.cases import Cases
 from seaopt.robustness.certificate.certificate import NO_MODEL, ROBUSTNESS_SCHEMA, Certificate
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
@@ -31,7 +31,7 @@ from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import MarginDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
-from seaopt.robustness.certificate.scheduled import ScheduleCertificate
+from seaopt.robustness.certificate.scheduled import take_worst
 from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
 from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
@@ -133,6 +133,7 @@ class StoredScheduleCertificate:
     plants: dict[str, StoredPlant]
     monte_carlo: MonteCarlo
     schedule: StoredPlaces
+    remarks: tuple[str, ...] = ()
 
 
 @record
@@ -160,16 +161,46 @@ def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
 
 
 def build_certificate(
-    stored: StoredCertificate,
-    content: Mapping[str, Any],
-    controller: Controller,
-    models: Mapping[str, Plant],
-    parameters: ParameterSet,
-    place: tuple[str, float] | None = None,
+    content: Mapping[str, Any], law: Controller | ScheduledController, posed: Mapping[float | None, Cases]
 ) -> Certificate:
-    """Return the certificate of what a robustness.json holds of one law, as `Certificate.from_dict` does."""
-    if controller.design is not None:  # certified too where nobody listed it
-        models = dict.fromkeys(DESIGN_NAMES, controller.design[0]) | dict(models)
+    """Return the certificate of a robustness.json, as `Certificate.from_dict` does."""
+    if isinstance(law, Controller):
+        (cases,) = posed.values()
+        return _build_one(read_certificate(content), content, cases, None)
+    check_file(content)
+    stored = from_content(StoredScheduleCertificate, content, FILE, remedy=CERTIFY_AGAIN)
+    found = stored.schedule
+    if len(found.places) != len(posed):
+        raise FileError(f"{FILE}: has {len(found.places)} places, and the schedule {len(posed)}; {CERTIFY_AGAIN}")
+    places = tuple(
+        _build_one(place, written, cases, (law.over, value))
+        for place, written, (value, cases) in zip(
+            found.places, content["schedule"]["places"], posed.items(), strict=True
+        )
+        if value is not None
+    )
+    return Certificate(
+        requirements=read_requirements(content),
+        monte_carlo=stored.monte_carlo,
+        controller=law.controllers[0],
+        models=places[-1].models,
+        parameters=places[-1].parameters,
+        varied=places[-1].varied,
+        schedule=law,
+        places=places,
+        stretches=found.stretches,
+        sweeps=found.sweeps,
+        motions=found.motions,
+        remarks=stored.remarks,
+        **take_worst(places),
+    )
+
+
+def _build_one(
+    stored: StoredCertificate, content: Mapping[str, Any], cases: Cases, place: tuple[str, float] | None
+) -> Certificate:
+    """Return the certificate of what a robustness.json holds of one law."""
+    controller, models, parameters = cases.controller, cases.models, cases.unknown.nominal
     varied, names = stored.varied, [row.name for row in stored.varied]
     states = {name: split_states(controller, {name: plant}, parameters, names) for name, plant in models.items()}
     models = {name: plant for name, plant in models.items() if any(state in stored.plants for state in states[name])}
@@ -251,31 +282,6 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
         **find_port_figures(certificate.controller),
     )
     return replace(certificate, simulated=simulated)
-
-
-def build_schedule_certificate(
-    content: Mapping[str, Any], schedule: ScheduledController, cases: Mapping[float, Cases]
-) -> ScheduleCertificate:
-    """Return the certificate of a schedule's robustness.json, as `ScheduleCertificate.from_dict` does."""
-    check_file(content)
-    stored = from_content(StoredScheduleCertificate, content, FILE, remedy=CERTIFY_AGAIN)
-    found = stored.schedule
-    if len(found.places) != len(cases):
-        raise FileError(f"{FILE}: has {len(found.places)} places, and the schedule {len(cases)}; {CERTIFY_AGAIN}")
-    return ScheduleCertificate(
-        schedule=schedule,
-        places=tuple(
-            build_certificate(place, written, at.controller, at.models, at.unknown.nominal, (schedule.over, value))
-            for place, written, (value, at) in zip(
-                found.places, content["schedule"]["places"], cases.items(), strict=True
-            )
-        ),
-        monte_carlo=stored.monte_carlo,
-        stretches=found.stretches,
-        sweeps=found.sweeps,
-        motions=found.motions,
-        requirements=read_requirements(content),
-    )
 
 
 def _measure_again(

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -34,7 +35,7 @@ from seaopt.control.loops.measured.plant import hold_response
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Experiment, Fit
 from seaopt.estimation.result.findings import Nuisance
-from seaopt.formatting import format_number, join_words
+from seaopt.formatting import join_words
 from seaopt.frequency.residual import LENGTHS, ResidualResponse, find_feedback, measure_residual
 from seaopt.frequency.response import ComplexLines, Lines, find_band
 from seaopt.frequency.sampled import sampled_response
@@ -73,18 +74,14 @@ class LogVerdict:
     unit: str
     at_amplitude: bool  # friction is dry: at another amplitude the response is another one
 
-    @property
-    def text(self) -> str:
-        """What it says, in words."""
-        low, high = (format_number(f, 3) for f in self.band_hz)
-        measured = "UNSTABLE" if np.isinf(self.ms) else f"Ms {self.ms:.3g}"
-        said = f"{self.samples} log {self.experiment}: measured {measured} at {self.ms_hz:.3g} Hz, "
-        said += f"predicted {self.ms_predicted:.3g}; it tells from {low} to {high} Hz"
-        if self.at_amplitude:
-            said += f", at its amplitude of {self.amplitude:.3g} {self.unit} rms"
-        if self.confidence is None:
-            return f"{said}; not independent"
-        return f"{said}; {self.outcome}" + ("" if self.outcome == "undecided" else f" at {100 * self.confidence:g} %")
+
+@record
+class SilentLog:
+    """A log that says nothing of the law's loop, and why."""
+
+    experiment: str
+    why: Literal["lacks a signal", "taken under feedback", "too weak", "an error"]
+    detail: str = ""
 
 
 @record(eq=False)
@@ -94,37 +91,54 @@ class _Record:
     experiment: Experiment
     samples: Samples
     own: Nuisance
+    command: Any
     model: Any  # outputs by rows, as the sensors' gains have them
     error: Any
     rows: slice
+    names: tuple[str, ...]  # of these outputs, which the law reads
+    dry: bool  # friction of the plant, so that the response is one of the log's amplitude
+
+    @property
+    def runs(self) -> list[slice]:
+        """The rows without a gap, in which nothing is missing."""
+        good = np.isfinite(self.command) & np.all(np.isfinite(self.model) & np.isfinite(self.error), axis=0)
+        good[: self.rows.start] = False
+        joined = np.zeros(good.size, dtype=bool)
+        for rows in self.experiment.log_segments:
+            joined[rows] = True
+            joined[rows.start] = False  # no run goes over a gap
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], (good & joined).astype(int), [0]]))).reshape(-1, 2)
+        return [slice(a, b) for a, b in edges.tolist()]
 
 
 def judge_log(
     controller: Controller, fit: Fit, experiment: Experiment, ms: float
-) -> tuple[tuple[LogVerdict, ...], str]:
+) -> tuple[tuple[LogVerdict, ...], SilentLog | None]:
     """Return what a log says of a law that is to keep Ms, whole and where it was held out; or why it says nothing."""
+    silent = partial(SilentLog, experiment=experiment.name)
     there = {*experiment.outputs, *experiment.log.signals.keys() & experiment.plant.inputs.keys()}
     needed = [controller.command.input, *(name for name in controller.signals if name in experiment.plant.outputs)]
     if lacking := [name for name in needed if name not in there]:
-        return (), f"log {experiment.name} does not judge the law: it has no {join_words(lacking)}"
-    under_law = f"log {experiment.name} was taken under feedback: its input carries its noise, and it judges no law"
+        return (), silent(why="lacks a signal", detail=join_words(lacking))
     if experiment.feedback or experiment.log.law or fit.method == "prediction_error":
-        return (), under_law
+        return (), silent(why="taken under feedback")
     try:
-        parts = list(_list_records(fit, experiment, controller))
-        if find_feedback(_read_command(controller, parts[0]), parts[0].error, _list_runs(controller, parts[0])):
-            return (), under_law
-        found = [_judge(controller, fit.parameters, part, ms * (1.0 + GRACE)) for part in parts]
+        whole, *parts = _list_records(fit, experiment, controller)
+        runs = whole.runs
+        if find_feedback(whole.command, whole.error, runs):
+            return (), silent(why="taken under feedback")
+        found = [_judge(controller, fit.parameters, part, part.runs, ms * (1.0 + GRACE)) for part in parts]
+        first = _judge(controller, fit.parameters, whole, runs, ms * (1.0 + GRACE))
     except SeaoptError as error:
-        return (), f"log {experiment.name} does not judge the law: {error}"
-    silent = f"log {experiment.name} says nothing of this loop: it is too short, or too weak"
-    return tuple(verdict for verdict in found if verdict), silent if found[:1] == [None] else ""
+        return (), silent(why="an error", detail=str(error))
+    verdicts = tuple(verdict for verdict in (first, *found) if verdict is not None)
+    return verdicts, silent(why="too weak") if first is None else None
 
 
 def _list_records(fit: Fit, experiment: Experiment, controller: Controller) -> Iterator[_Record]:
     """Yield a log with its simulation, and what was held out of it alone."""
     predicted, n = fit.predict(experiment), len(experiment.log)
-    names = [name for name in controller.signals if name in experiment.outputs]
+    names = tuple(name for name in controller.signals if name in experiment.outputs)
     gain = np.array([predicted.own.gain[name] for name in names])[:, None]
     model = np.array([predicted.model[name] for name in names]) / gain
     error = np.array([predicted.measured[name] for name in names]) / gain - model
@@ -132,9 +146,12 @@ def _list_records(fit: Fit, experiment: Experiment, controller: Controller) -> I
         experiment=experiment,
         samples="fitted" if any(_shares(each, experiment, fit.holdout) for each in fit.experiments) else "validate",
         own=predicted.own,
+        command=experiment.log[controller.command.input],
         model=model,
         error=error,
         rows=slice(0, n),
+        names=names,
+        dry=has_friction(experiment.plant, experiment.apply_own(fit.parameters)),
     )
     yield whole
     if fit.holdout and any(experiment is each for each in fit.experiments):
@@ -154,43 +171,25 @@ def _shares(fitted: Experiment, other: Experiment, holdout: float) -> bool:
     return bool(names) and a.size > SHARED * len(other.log) and all(same)
 
 
-def _list_runs(controller: Controller, part: _Record) -> list[slice]:
-    """Return the rows of a record without a gap, in which nothing is missing."""
-    log, command = part.experiment.log, _read_command(controller, part)
-    good = np.isfinite(command) & np.all(np.isfinite(part.model) & np.isfinite(part.error), axis=0)
-    good[: part.rows.start] = False
-    joined = np.zeros(len(log), dtype=bool)
-    for rows in part.experiment.log_segments:
-        joined[rows] = True
-        joined[rows.start] = False  # no run goes over a gap
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (good & joined).astype(int), [0]]))).reshape(-1, 2)
-    return [slice(a, b) for a, b in edges.tolist()]
-
-
-def _measure(controller: Controller, part: _Record) -> list[ResidualResponse]:
+def _measure(controller: Controller, part: _Record, runs: list[slice]) -> list[ResidualResponse]:
     """Return the response of a record, up to where a law's loop can be told from it."""
-    log, command, runs = part.experiment.log, _read_command(controller, part), _list_runs(controller, part)
-    if not runs or np.ptp(np.concatenate([command[run] for run in runs])) == 0.0:
+    period = part.experiment.log.period
+    if not runs or np.ptp(np.concatenate([part.command[run] for run in runs])) == 0.0:
         return []
     return measure_residual(
-        command,
+        part.command,
         part.model,
         part.error,
-        log.period,
+        period,
         runs,
         longest_s=PERIODS / controller.spec.bandwidth_hz,
-        highest_hz=HIGHEST * 0.5 / max(log.period, controller.sample_time_s),
+        highest_hz=HIGHEST * 0.5 / max(period, controller.sample_time_s),
     )
-
-
-def _read_command(controller: Controller, part: _Record) -> Any:
-    """Return what the log has of the command."""
-    return part.experiment.log[controller.command.input]
 
 
 def _weigh(controller: Controller, part: _Record, f: Lines) -> Complex[np.ndarray, "y m"]:
     """Return what of the loop gain is the law's, per response of the log's outputs: at the law's hold and delays."""
-    read = [name in part.experiment.outputs for name in controller.signals]
+    read = [name in part.names for name in controller.signals]
     feedback = controller.law.feedback_responses(f)[: len(read)][read]
     clock = Clock(period=part.experiment.log.period, hold=part.experiment.hold)
     ratio = hold_response(f, Clock(period=controller.sample_time_s)) / hold_response(f, clock)
@@ -204,8 +203,8 @@ def _weigh(controller: Controller, part: _Record, f: Lines) -> Complex[np.ndarra
 
 def _find_base(controller: Controller, params: ParameterSet, part: _Record, f: Lines) -> Any:
     """Return the linear model's outputs per input as the log's clock has them."""
-    experiment, names = part.experiment, [name for name in controller.signals if name in part.experiment.outputs]
-    model = linearise(make_model(experiment.plant, experiment.apply_own(params), (), tuple(names)))
+    experiment = part.experiment
+    model = linearise(make_model(experiment.plant, experiment.apply_own(params), (), part.names))
     clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=part.own.delay_s)
     source = list(experiment.plant.inputs).index(controller.command.input)
     return sampled_response(model, np.zeros(0), clock, f, source)[0].T
@@ -244,13 +243,12 @@ def _tell(
     f = response.frequency_hz
     c = _weigh(controller, part, f)
     loop, error, std, unseen = response.read(c)
-    dry = _is_dry(params, part)
-    if not dry:
+    if not part.dry:
         loop = np.sum(c * _find_base(controller, params, part, f), axis=0)
     radius = std * response.widen(alpha) + unseen
     size = np.maximum(np.abs(1.0 + loop), np.abs(1.0 + loop + error))
     told = median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC
-    if dry:  # what transients and friction make of the model's own response is no loop gain
+    if part.dry:  # what transients and friction make of the model's own response is no loop gain
         rough = np.sum(np.abs(c) * np.sqrt(response.rough), axis=0) * response.widen(CONFIRM)
         told &= median_filter(rough / size, SMOOTH, mode="nearest") < LARGEST_DISC
     if np.count_nonzero(told) < FEWEST_LINES:
@@ -263,13 +261,11 @@ def _tell(
     )
 
 
-def _is_dry(params: ParameterSet, part: _Record) -> bool:
-    return has_friction(part.experiment.plant, part.experiment.apply_own(params))
-
-
-def _judge(controller: Controller, params: ParameterSet, part: _Record, limit: float) -> LogVerdict | None:
+def _judge(
+    controller: Controller, params: ParameterSet, part: _Record, runs: list[slice], limit: float
+) -> LogVerdict | None:
     """Return what a record says of a law; None where it says nothing."""
-    responses = _measure(controller, part)
+    responses = _measure(controller, part, runs)
     alpha = REFUTE / max(sum(response.frequency_hz.size for response in responses), 1)
     told = [_tell(controller, params, part, response, alpha) for response in responses]
     kinds = [lines for lines in told if lines is not None]
@@ -292,9 +288,9 @@ def _judge(controller: Controller, params: ParameterSet, part: _Record, limit: f
         ms_least=least,
         ms_predicted=float(1.0 / surest.predicted[at]),
         confidence=None if not independent else 1.0 - (REFUTE if refuted else CONFIRM),
-        amplitude=float(np.nanstd(_read_command(controller, part)[part.rows])),
+        amplitude=float(np.nanstd(part.command[part.rows])),
         unit=controller.command.unit,
-        at_amplitude=_is_dry(params, part),
+        at_amplitude=part.dry,
     )
 
 

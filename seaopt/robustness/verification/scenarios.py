@@ -347,7 +347,7 @@ def find_step_limit(controller: Controller) -> float | None:
     if limit is None:
         return None
     sliding = take_sliding(plant, params)
-    if not controller.close(sliding, params).figures().stable:
+    if not controller.close(sliding, params).is_stable():
         return controller.force_limit(0.0)
     loop = build_loop(controller, sliding, params, runnable(controller, command_limit=math.inf, gate=False, heat=False))
     tried = NOMINAL_EFFORT[controller.command.mechanics]

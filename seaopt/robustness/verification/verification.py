@@ -98,14 +98,20 @@ class Verification(Result, Worded):
         drawn = self.draws[row.plant][0 if row.draw == NOMINAL else int(row.draw)]
         return play(self.stages[row.plant], scenario, [drawn], seed=self.seed)
 
+    def has_loop(self, stage: Stage, name: str, nominal: ParameterSet) -> bool:
+        """Tell whether these are runs of a stage's law on its plant, at these nominal parameters."""
+        before = self.stages.get(name)
+        if before is None or before.controller is not stage.controller or before.plant is not stage.plant:
+            return False
+        return self.draws[name][0] is nominal
+
     def recall(
         self, stage: Stage, name: str, scenario: Scenario, draws: Sequence[ParameterSet], seed: int
     ) -> list[Outcome]:
         """Return the rows of a scenario that was played on this stage, at these draws; none if it was not."""
-        before = self.stages.get(name)
-        if before is None or before.controller is not stage.controller or before.plant is not stage.plant:
+        if not self.has_loop(stage, name, draws[0]):
             return []
-        devices, same = ((each.sensors, each.command_step) for each in (before, stage))
+        devices, same = ((each.sensors, each.command_step) for each in (self.stages[name], stage))
         same_draws = list(map(id, self.draws[name])) == list(map(id, draws))
         held = any(phase.held for phase in scenario.phases)  # by a partner, which may be another one
         if held or devices != same or self.seed != seed or not same_draws or scenario not in self.scenarios[name]:
@@ -290,7 +296,9 @@ def verify(
         scenarios={name: tuple(runs.actual for runs in of_plant if runs.outcomes) for name, of_plant in played.items()},
         draws=sets,
         follows_hz={
-            name: controller.close(take_sliding(stage.plant, parameters), parameters).figures().tracking_band_hz
+            name: known.follows_hz[name]
+            if known is not None and known.has_loop(stage, name, parameters)
+            else controller.close(take_sliding(stage.plant, parameters), parameters).figures().tracking_band_hz
             for name, stage in stages.items()
         },
     )

@@ -19,7 +19,6 @@ from seaopt.files import seal, to_json
 from seaopt.parameters import Parameter
 from seaopt.robustness import batch_figures, failure_bound
 from seaopt.robustness.certificate.cases import digest_laws
-from seaopt.robustness.certificate.certify import CertifyKeywords
 from seaopt.robustness.certificate.friction import friction_requirements
 from seaopt.robustness.certificate.simulated import STEPS
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges
@@ -507,10 +506,3 @@ def test_a_friction_margin_below_the_curves_own_slope_is_required_over_draws_too
     (row,) = [row for row in certificate.requirements if row.name == "min_friction_margin"]
     assert row.value == min(*margin.slopes, drawn.least_slope) < margin.slopes[0]
     assert so.certify(controller, {"stand": stand}, sharp, **asked, simulations=False).friction_draws == {}
-
-
-def test_a_type_checker_sees_every_keyword():
-    keywords = [
-        each.name for each in inspect.signature(so.certify).parameters.values() if each.kind == each.KEYWORD_ONLY
-    ]
-    assert keywords == list(CertifyKeywords.__annotations__)

@@ -15,13 +15,12 @@ from seaopt.errors import ControlError, FileError
 from seaopt.executors import Shared
 from seaopt.files import to_json
 from seaopt.progress import ignore
-from seaopt.robustness import ScheduleCertificate
 from seaopt.robustness.certificate import scheduled
-from seaopt.robustness.certificate.cases import CertifyOptions, Survey, add_design
-from seaopt.robustness.certificate.certify import _require_responses
+from seaopt.robustness.certificate.cases import CertifyOptions, Survey, add_design, pose
 from seaopt.robustness.certificate.friction import FRICTION, MarginDraws
+from seaopt.robustness.certificate.limits import measure_responses
 from seaopt.robustness.certificate.measured_draws import measure_draws
-from seaopt.robustness.certificate.scheduled import pose_places, require_motion, require_rate
+from seaopt.robustness.certificate.scheduled import require_motion, require_rate
 from seaopt.robustness.verification import limit_cycles, schedule_sweep, verification
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
@@ -98,7 +97,7 @@ def test_a_draw_that_lies_on_its_limit_keeps_it():
     """Ms one by one: a limit below the largest by half of what rounding may do is kept, by ten times that it is not."""
     _, swing, values = read_knee()
     plants, ranges, rng = {"swing": swing}, {"I_p": (0.33, 0.39)}, np.random.default_rng(1)
-    cases = pose_places(tune_knee(), plants, values, ranges, so.ParameterSet())[0.2]
+    cases = pose(tune_knee(), plants, values, ranges, so.ParameterSet())[0.2]
     drawn = cases.unknown.list_draws(4, rng)
     largest = max(cases.controller.close(swing, values.update(phi=0.2, **draw)).figures().ms for draw in drawn)
     for beyond, fails in ((5e-7, False), (1e-5, True)):
@@ -172,7 +171,7 @@ def test_friction_is_looked_at_on_a_plant_that_moves_the_variable_and_over_draws
     """Viscous friction is in the sector: with as much of it as is shown the eigenvalues by hand are stable."""
     swing, values = read_rubbing_knee(tmp_path)
     schedule, ranges = ask(tune_knee(), min_friction_margin=1e9), {"I_p": (0.33, 0.39), "f_c": (5.0, 10.0)}
-    cases = pose_places(schedule, {"stand": read_knee()[0], "swing": swing}, values, ranges, so.ParameterSet())[0.2]
+    cases = pose(schedule, {"stand": read_knee()[0], "swing": swing}, values, ranges, so.ParameterSet())[0.2]
     rng = np.random.default_rng(2)
     survey = Survey(
         subject=schedule,
@@ -233,6 +232,21 @@ def test_a_motion_slower_than_the_rate_asked_is_not_met():
         assert not rings.met and rings.value == 0.0
 
 
+def judge_responses(schedule, parameters, measured):
+    place = next(iter(pose(schedule, {}, read_knee()[2], {}, so.ParameterSet()).values()))
+    rng = np.random.default_rng(1)
+    survey = Survey(
+        subject=schedule,
+        shared=Shared(place),
+        source=parameters,
+        options=CertifyOptions(),
+        drawing=rng,
+        rng=rng,
+        measured=measured,
+    )
+    return measure_responses(replace(survey, places=[survey]), ignore).requirements
+
+
 def test_a_measured_response_is_judged_with_the_law_of_the_value_that_the_parameters_have():
     """A response measured without error, by the lever's equations: Ms is the largest of the measured points."""
     stand, swing, values = read_knee()
@@ -246,7 +260,7 @@ def test_a_measured_response_is_judged_with_the_law_of_the_value_that_the_parame
         name="chirp", plant=stand, source="I", output="tau", clock=Clock(period=ts, hold="zero", delay_s=0.0),
         frequency_hz=f, response=v["K_f"] * response, radius=0.0 * f, confidence=0.95, averages=np.full(f.size, 100),
     )  # fmt: skip
-    rows = {row.name: row for row in _require_responses(schedule, None, there, {"frf:chirp": measured})}
+    rows = {row.name: row for row in judge_responses(schedule, there, {"frf:chirp": measured})}
     g, q = schedule.at(0.2).gains, 1.0 / z
     slope = (1.0 - q) / (g["T_f"] + ts - g["T_f"] * q)
     law = g["k_p"] + g["k_i"] * ts / 2 * (1.0 + q) / (1.0 - q) + g["k_d"] * slope
@@ -254,11 +268,11 @@ def test_a_measured_response_is_judged_with_the_law_of_the_value_that_the_parame
     assert rows["max_sensitivity"].value == pytest.approx(np.max(np.abs(1.0 / (1.0 + response * law * q))), rel=2e-3)
     elsewhere = replace(measured, name="other", values={"phi": 0.4})
     with pytest.raises(ControlError, match="frf:other was taken at phi = 3, outside the points"):
-        _require_responses(schedule, None, there, {"frf:other": replace(elsewhere, values={"phi": 3.0})})
-    both = _require_responses(schedule, None, there, {"frf:other": elsewhere, "frf:chirp": measured})
+        judge_responses(schedule, there, {"frf:other": replace(elsewhere, values={"phi": 3.0})})
+    both = judge_responses(schedule, there, {"frf:other": elsewhere, "frf:chirp": measured})
     assert [row.place for row in both if row.name == "max_sensitivity"] == [("phi", 0.4), ("phi", 0.2)]
     with pytest.raises(ControlError, match="one value of phi, which is not given"):
-        _require_responses(schedule, None, so.ParameterSet(), {"frf:chirp": replace(measured, plant=swing)})
+        judge_responses(schedule, so.ParameterSet(), {"frf:chirp": replace(measured, plant=swing)})
 
 
 def test_a_range_of_what_it_is_over_is_refused():
@@ -287,7 +301,7 @@ def test_a_file_reads_back_without_simulating(certificate, monkeypatch):
                          (limit_cycles, "run_loop"), (scheduled, "bound_stretch")):  # fmt: skip
         monkeypatch.setattr(module, name, refuse)
     plants = {"stand": stand, "swing": swing}
-    again = ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
+    again = so.Certificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
     own = json.loads(to_json(again.to_dict()))
     content["made_from"] = own["made_from"] = None  # digests change with the last digit
     assert not list(compare(content, own, "", sentences=True))
@@ -296,14 +310,14 @@ def test_a_file_reads_back_without_simulating(certificate, monkeypatch):
     content = json.loads(to_json(found.to_dict()))
     content["schedule"]["places"][0]["plants"]["stand"]["worst"]["ms"] = 1.0
     with pytest.raises(FileError, match=r"was edited"):
-        ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
+        so.Certificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
     content = json.loads(to_json(found.to_dict()))
     content["schedule"]["stretches"] = []
     with pytest.raises(FileError, match=r"was edited"):
-        ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
+        so.Certificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
     del content["made_from"]
     with pytest.raises(FileError, match=r"written by hand"):
-        ScheduleCertificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
+        so.Certificate.from_dict(content, found.schedule, plants, values, ranges=RANGES)
 
 
 def test_what_is_written_is_json_with_its_verdict(certificate):

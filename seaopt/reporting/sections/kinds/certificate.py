@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from seaopt.control import Controller
+from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT, OTHER_NOISE
 from seaopt.control.laws.verdict import advise_easing
 from seaopt.formatting import MISSING, format_band, format_count, format_number, format_values, join_words
@@ -27,6 +27,7 @@ from seaopt.reporting.sections.kinds.verification import describe_steps
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.certificate import NO_MODEL
 from seaopt.robustness.certificate.requirement import DESIGN_PLANT, Failure, Requirement, group_failures
+from seaopt.robustness.certificate.scheduled import name_rate_unit
 from seaopt.robustness.uncertainty.draws import Plants
 from seaopt.units import unit_after
 
@@ -66,6 +67,8 @@ SWINGS = (
 
 def judge(certificate: Certificate, commands: Commands) -> Verdict:
     """Return the verdict on a certificate."""
+    if certificate.schedule is not None:
+        return _judge_schedule(certificate, certificate.schedule, commands)
     draws = certificate.monte_carlo
     if certificate.met:
         runs = "" if certificate.runs is None else f", {len(certificate.runs.rows)} simulated runs passed"
@@ -93,6 +96,31 @@ def judge(certificate: Certificate, commands: Commands) -> Verdict:
         text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
         reasons=tuple(reasons),
         next=(command, *([costs] if certificate.constrained is None else ())),
+    )
+
+
+def _judge_schedule(certificate: Certificate, schedule: ScheduledController, commands: Commands) -> Verdict:
+    """Return the verdict on a schedule's certificate, with its assumption."""
+    draws = certificate.monte_carlo
+    if certificate.met:
+        drawn = (
+            f"{format_count(draws.failures, 'failure')} in {draws.samples} draws"
+            if draws.samples
+            else "nothing was uncertain, so that nothing was drawn"
+        )
+        rate = f"{certificate.fastest:.3g} {name_rate_unit(schedule)}"
+        swept = f"; {schedule.over} up to {rate} in sweeps" if certificate.sweeps else ""
+        return Verdict(met=True, text=f"Certificate: passed with {schedule.over} standing still, {drawn}{swept}")
+    broken = [row for row in certificate.requirements if not row.met]
+    laws, models = schedule.controllers, certificate.models
+    command = f"type {commands.certify}" if commands.certify else "tune again"
+    remedies = (row.remedy or advise(row, *laws, models=models) for row in broken)
+    change = next((text for text in remedies if text), "raise reserve, or add points")
+    return Verdict(
+        met=False,
+        text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
+        reasons=tuple(explain_failure(failure, *laws, models=models) for failure in group_failures(broken)),
+        next=(schedule.remedy or f"{change}; then {command}",),
     )
 
 
@@ -138,8 +166,8 @@ def explain_failure(failure: Failure, *controllers: Controller, models: Plants) 
 
 
 def summarise(certificate: Certificate) -> list[KeyFigure]:
-    """Return the largest Ms found, and how many draws failed; nothing of measured points alone."""
-    if not certificate.models:
+    """Return the largest Ms found, and how many draws failed; nothing of measured points alone, or of a schedule."""
+    if not certificate.models or certificate.schedule is not None:
         return []
     level, draws = certificate.controller.spec.level("max_sensitivity"), certificate.monte_carlo
     ms = max(worst.ms for worst in certificate.worst.values())
@@ -152,7 +180,14 @@ def summarise(certificate: Certificate) -> list[KeyFigure]:
 
 
 def describe(certificate: Certificate) -> list[Section]:
-    """Return the margins of every plant, the requirements, the worst cases, the draws, and the findings."""
+    """Return the margins of every plant, the requirements, the worst cases, the draws, and the findings; of a schedule
+    the figures at every value of its variable.
+    """
+    if certificate.schedule is not None:
+        return [
+            _tabulate_places(certificate, certificate.schedule),
+            *list_notes("the schedule's certificate", certificate.notes),
+        ]
     left_out = [] if certificate.simulated is None else list_left_out(certificate.simulated)
     return [
         _list_requirements(certificate),
@@ -173,6 +208,29 @@ def describe(certificate: Certificate) -> list[Section]:
         *_describe_draws(certificate),
         *list_notes("the certificate", [*certificate.notes, *left_out]),
     ]
+
+
+def _tabulate_places(certificate: Certificate, schedule: ScheduledController) -> Section:
+    """Return the figures at every value of a schedule's variable."""
+    rows = tuple(
+        (
+            f"{value:.4g}",
+            "point" if value in schedule.points else "between",
+            f"{max(figures.ms for figures in place.plants.values()):.3f}",
+            f"{max(figures.mt for figures in place.plants.values()):.3f}",
+            f"{max(case.ms for case in place.worst.values()):.3f}",
+            f"{place.monte_carlo.failures} of {place.monte_carlo.samples}",
+        )
+        for value, place in zip(certificate.values, certificate.places, strict=True)
+    )
+    head = (f"{schedule.over}{unit_after(schedule.unit)}", "", "Ms", "Mt", "worst Ms", "draws that fail")
+    return Section(
+        title="What is certified",
+        aside=certificate.monte_carlo.count_text,
+        part="schedule",
+        tables=(Table(head=head, rows=rows, align="><>>>>"),),
+        remarks=(f"{certificate.monte_carlo}.",),
+    )
 
 
 def _swings(certificate: Certificate) -> bool:
