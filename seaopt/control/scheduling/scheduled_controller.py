@@ -238,18 +238,7 @@ class ScheduledController(Result, Worded):
         outer : bool
             With its outer loop, where it has one.
         """
-        first = self.controllers[0]
-        law = make_runnable(
-            self.table,
-            per_effort=self.command.per_effort,
-            limit=first.command_limit if limit is None else self.command.limit(limit),
-            fallback=self.fallback,
-            tracking_time_s=tracking_time_s,
-            command=(self.command.input, self.command.unit),
-            compensations=[each.compensation for each in self.controllers],
-        )
-        around = first.outer if outer else None
-        return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None, outer=around)
+        return _make_runnable(self, limit, tracking_time_s, outer)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of controller.json (schema seaopt/controller/3)."""
@@ -295,6 +284,24 @@ class ScheduledController(Result, Worded):
             others=others or {},
             fallback=table.fallback,
         ).with_places()
+
+
+@lru_cache(maxsize=8)
+def _make_runnable(
+    schedule: ScheduledController, limit: float | None, tracking_time_s: float | None, outer: bool
+) -> RunnableSchedule:
+    first = schedule.controllers[0]
+    law = make_runnable(
+        schedule.table,
+        per_effort=schedule.command.per_effort,
+        limit=first.command_limit if limit is None else schedule.command.limit(limit),
+        fallback=schedule.fallback,
+        tracking_time_s=tracking_time_s,
+        command=(schedule.command.input, schedule.command.unit),
+        compensations=[each.compensation for each in schedule.controllers],
+    )
+    around = first.outer if outer else None
+    return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None, outer=around)
 
 
 @lru_cache(maxsize=8)
