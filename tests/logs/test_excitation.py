@@ -56,3 +56,19 @@ def test_a_response_without_a_peak_is_not_said_to_hide_the_inertia():
     log = so.Log.from_arrays(time=np.arange(n) / rate, I=u, F1=y + 1e-4 * rng.normal(size=n))
     (finding,) = log.quality.of("excitation")
     assert "cannot" not in finding.sentence and "falls to half" in finding.sentence
+
+
+def test_of_one_sine_it_is_not_said_that_inertia_hardly_matters():
+    """A spring's torque and its motor's angle under 1 Hz, resonance 5.4 Hz: least squares find J to 1 %."""
+    t = np.arange(4000) / 500.0
+    rng, w = np.random.default_rng(2), 2.0 * np.pi
+    inertia, damping, stiffness = 2.4e-5, 1e-4, 0.03
+    u = 0.2 * np.sin(w * t)
+    response = 1.0 / (stiffness - inertia * w**2 + 1j * damping * w)
+    theta, speed, rise = (0.2 * np.imag(response * (1j * w) ** n * np.exp(1j * w * t)) for n in range(3))
+    torque = stiffness * theta + 1e-4 * rng.normal(size=t.size)
+    known = np.linalg.lstsq(np.stack([rise, speed], 1), u - torque, rcond=None)[0]
+    assert known[0] == pytest.approx(inertia, rel=0.01)
+    log = so.Log.from_arrays(time=t, I=u, tau_s=torque, theta_m=theta + 1e-4 * rng.normal(size=t.size))
+    (finding,) = assess_quality(log, inputs=["I"]).of("excitation")
+    assert "little effect" not in finding.sentence and "only a fit tells" in finding.sentence

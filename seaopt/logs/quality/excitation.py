@@ -126,7 +126,7 @@ class InputExcitation:
         elif half is not None:
             sentence += f"; the response of {self.output} has fallen to half near {half:.2g} Hz, without a peak"
         elif self.bands[0].gain is not None:
-            sentence += "; no response falls to half in there: inertia and stiffness have little effect on it"
+            sentence += "; no response falls to half in there: only a fit tells how well it shows inertia and stiffness"
         if low > 4.0 * self.bands[0].low_hz:
             sentence += f"; nothing linear below {low:.3g} Hz, where static gain and friction would be told apart"
         return sentence
