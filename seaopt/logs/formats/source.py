@@ -30,6 +30,7 @@ MAX_DEPTH = 32  # of groups, structs, objects or messages inside one another
 
 Location = TypeVar("Location")
 Where = Mapping[str, str | float]  # column to the value that its rows have
+Loaded = dict[str, Float[np.ndarray, " _"]]
 
 
 @record
@@ -69,16 +70,16 @@ class Source:
     fields: tuple[Field, ...]
     # Of (names, window): float arrays by name, for fields that share a clock. With a window it may return more samples
     # than lie in it, but the same ones for every name.
-    load: Callable[[Sequence[str], Window | None], dict[str, Float[np.ndarray, " _"]]]
+    load: Callable[[Sequence[str], Window | None], Loaded]
     notes: tuple[str, ...] = ()  # what was found on listing
     # what the header says besides columns: number and unit by name
     constants: Mapping[str, tuple[float, str | None]] = field(default_factory=dict[str, tuple[float, str | None]])
     # Of (names, where): as `load`, of the rows in which columns, of text too, have given values.
-    load_where: Callable[[Sequence[str], Where], dict[str, Float[np.ndarray, " _"]]] | None = None
+    load_where: Callable[[Sequence[str], Where], Loaded] | None = None
     rows: str = ""  # which rows are read, where not all are
     law: str = ""  # hash of the law that it says it was taken under
 
-    def read(self, names: Sequence[str], window: Window | None = None) -> dict[str, Float[np.ndarray, " _"]]:
+    def read(self, names: Sequence[str], window: Window | None = None) -> Loaded:
         """Return the data of fields that share a clock. Raises LogError: damage, or a cell that is not a number."""
         with translate_errors(self.path, self.format):
             return self.load(list(dict.fromkeys(names)), window)
@@ -99,7 +100,7 @@ def keep_rows(source: Source, where: Where) -> Source:
                 "save the table as CSV"
             )
 
-    def load(names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " _"]]:
+    def load(names: Sequence[str], window: Window | None) -> Loaded:
         if source.load_where is not None:
             columns = source.load_where(names, where)
         else:
@@ -114,15 +115,13 @@ def keep_rows(source: Source, where: Where) -> Source:
     return replace(source, fields=fields, load=load, load_where=None, rows=rows)
 
 
-def make_row_loader(
-    load: Callable[[str, slice], Any],
-) -> Callable[[Sequence[str], Window | None], dict[str, Float[np.ndarray, " _"]]]:
+def make_row_loader(load: Callable[[str, slice], Any]) -> Callable[[Sequence[str], Window | None], Loaded]:
     """Return the `load` of a source whose fields can be read by name and rows."""
 
     def load_column(name: str, rows: slice) -> Float[np.ndarray, " _"]:
         return np.array(load(name, rows), dtype=float).reshape(-1)
 
-    def load_columns(names: Sequence[str], window: Window | None) -> dict[str, Float[np.ndarray, " _"]]:
+    def load_columns(names: Sequence[str], window: Window | None) -> Loaded:
         rows = slice(None) if window is None else find_rows(load_column(window.clock, slice(None)), window)
         return {name: load_column(name, rows) for name in names}
 

@@ -165,7 +165,7 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
         lines.known("k_n", text, lines.value("k_s"), "that of the spring")
         parts.append("deflection_sensor")
     options = {"parts": parts} if parts else {}
-    plants = {place: {"kind": "rotary", "link": _LINKS[place], **options} for place in dict.fromkeys(places)}
+    plants = {place: {"kind": "rotary", "link": _LINKS[place], **options} for place in places}
     return Proposed(lines=tuple(lines.lines), plants=plants, measured=measured, ranges=ranges)
 
 
@@ -261,7 +261,7 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
             places.append("swing")
             ranges["I_p"] = (WIDE[0] * inertia, WIDE[1] * inertia)
     options = {"drive": "unlumped", **({"parts": list(lines.parts)} if lines.parts else {})}
-    plants = {place: {"kind": _SCREWS[place], **options} for place in dict.fromkeys(places)}
+    plants = {place: {"kind": _SCREWS[place], **options} for place in places}
     return Proposed(lines=tuple(lines.lines), plants=plants, measured=measured, ranges=ranges)
 
 
