@@ -134,7 +134,7 @@ def test_energy_is_conserved(links, drive, spring, parts):
 
     # One combination for longer: two and a half periods of its slowest input, and all of its parts.
     duration_s = 0.15 if (links, drive, spring, parts) == LONGER else 0.06
-    run = solve_ivp(extended, (0, duration_s), np.r_[start, 0, 0], method="DOP853", rtol=1e-11, atol=1e-13)
+    run = solve_ivp(extended, (0, duration_s), np.r_[start, 0, 0], method="DOP853", rtol=1e-12, atol=1e-14)
     first, last = (
         books(zip(plant.states, run.y[:n, k], strict=True), inputs(0), links, drive, spring, parts, p)[0]
         for k in (0, -1)
