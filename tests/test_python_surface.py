@@ -63,6 +63,13 @@ def test_importing_is_clean_and_loads_nothing_heavy():
     assert found.stdout.strip() == "[]"
 
 
+def test_no_name_loads_what_takes_half_a_second():
+    heavy = ("scipy.signal", "scipy.stats", "scipy.optimize", "matplotlib")
+    code = f"import sys, seaopt as so; [getattr(so, n) for n in so.__all__]; print([*filter(sys.modules.get, {heavy})])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
 def test_the_fit_says_what_it_found(named):
     fit = named.fit
     assert fit.met and fit.status == "converged" and fit.identifiability.rank == 3

@@ -29,9 +29,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import brentq
-from scipy.special import ndtr
-from scipy.stats import norm, t
+from scipy.special import ndtr, ndtri, stdtr
 
 from seaopt.errors import SeaoptError
 from seaopt.records import record
@@ -84,6 +82,8 @@ def choose_threshold(probability: float, runs: int, charts: int) -> float:
         raise SeaoptError(f"false_alarms = {probability:g} is no probability above 0 and below 1; give 0.01")
     if probability < LEAST:
         raise SeaoptError(f"false_alarms = {probability:g} is too small; give {LEAST:g} or more")
+    from scipy.optimize import brentq  # deferred: 0.2 s
+
     share = probability / (2 * charts)
 
     def exceed(threshold: float) -> float:
@@ -193,7 +193,7 @@ def _normalise(ratio: VectorN, dof: float) -> VectorN:
     """Return what is distributed as Student's t as what is standard normal."""
     if dof > LEARNT_DOF:
         return ratio
-    return np.sign(ratio) * norm.isf(np.maximum(t.sf(np.abs(ratio), dof), 1e-300))
+    return np.sign(ratio) * -ndtri(np.maximum(stdtr(dof, -np.abs(ratio)), 1e-300))
 
 
 def find_change(values: VectorN, weights: VectorN) -> int:

@@ -25,8 +25,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.optimize import brentq, minimize, minimize_scalar
-from scipy.stats import chi2, norm, t
+from scipy.special import chdtr, chdtrc
 
 from seaopt.codec import OrInfinite
 from seaopt.fleet.cusum import Runs
@@ -35,8 +34,8 @@ from seaopt.records import record
 from seaopt.signals import VectorN
 
 CLIP_SQUARE = 6.0  # standardised squared differences count for no more; 1.4 % of those of healthy actuators are larger
-CLIPPED = chi2.cdf(CLIP_SQUARE, 3) + CLIP_SQUARE * chi2.sf(CLIP_SQUARE, 1)  # mean of a clipped square, if normal
-CLIPPED_SQUARE = 3.0 * chi2.cdf(CLIP_SQUARE, 5) + CLIP_SQUARE**2 * chi2.sf(CLIP_SQUARE, 1)  # of its square
+CLIPPED = chdtr(3, CLIP_SQUARE) + CLIP_SQUARE * chdtrc(1, CLIP_SQUARE)  # mean of a clipped square, if normal
+CLIPPED_SQUARE = 3.0 * chdtr(5, CLIP_SQUARE) + CLIP_SQUARE**2 * chdtrc(1, CLIP_SQUARE)  # of its square
 FEWEST_PAIRS = 8  # of runs that follow each other, in the whole fleet, from which a variance can be told
 FEWEST_OF_SHAPE = 200  # pairs from which correlation and tails can be told
 FEWEST_ACTUATORS = 10  # of which it can be told whether they scatter alike
@@ -142,6 +141,7 @@ def _list_differences(runs: Sequence[tuple[Runs, Runs]], lag: int) -> tuple[Vect
 
 def _find_variance(squares: VectorN, fits: VectorN) -> float:
     """Return the variance of one of two runs, beyond that of the fits, which squared differences have."""
+    from scipy.optimize import brentq  # deferred: 0.2 s
 
     def exceed(variance: float) -> float:
         ratios = squares / np.maximum(2.0 * variance + fits, 1e-300)
@@ -154,6 +154,8 @@ def _find_variance(squares: VectorN, fits: VectorN) -> float:
 
 def _fit_variogram(variogram: VectorN, fit: float, pairs: int) -> tuple[float, float]:
     """Return variance and correlation, by least squares of sigma^2 (1 - phi^k); the latter by an error larger."""
+    from scipy.optimize import minimize_scalar  # deferred: 0.2 s
+
     lags = np.arange(1, variogram.size + 1)
 
     def fit_variance(correlation: float) -> float:
@@ -174,7 +176,7 @@ def _count_freedom(fits: VectorN, variance: float) -> float:
     """Return the degrees of freedom of a run's variance, from the sampling variance of the clipped mean square.
     Differences that share a run are correlated by -1/2, their squares by 1/4: half as much again as if they were not.
     """
-    slope = np.mean(2.0 / (2.0 * variance + fits)) * chi2.cdf(CLIP_SQUARE, 3)
+    slope = np.mean(2.0 / (2.0 * variance + fits)) * chdtr(3, CLIP_SQUARE)
     sampling = 1.5 * (CLIPPED_SQUARE - CLIPPED**2) / fits.size / slope**2
     return float(2.0 * (variance + np.median(fits) / 2.0) ** 2 / sampling)
 
@@ -185,6 +187,9 @@ def estimate_tails(ratios: VectorN) -> tuple[float, float]:
     """
     if ratios.size < FEWEST_OF_SHAPE:
         return np.inf, 1.0
+    from scipy.optimize import minimize  # deferred, as the next: 0.2 s
+    from scipy.stats import norm, t  # 0.5 s
+
     chosen = ratios[:: -(-ratios.size // MOST_OF_TAILS)]
 
     def miss(unknown: Float[np.ndarray, " two"]) -> float:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from seaopt import welch
 from seaopt.errors import EstimationError
 from seaopt.estimation import Diagnostics, Fit, ModelledOutputs
 from seaopt.reporting.figures.panel import BAND, BLUE, COLOURS, LIMIT, MEASURED, Panel, draw_level, frequency_panel
@@ -127,8 +128,6 @@ def spectrum_panel(prediction: ModelledOutputs) -> Panel:
 
 def amplitude_density(values: VectorN, period: float) -> tuple[VectorM, VectorM]:
     """Return frequencies and root power density of the longest whole run. Raises EstimationError: too short."""
-    from scipy.signal import welch  # deferred: 0.3 s
-
     run = _find_longest_run(values)
     if run.size < FEWEST_SAMPLES:
         raise EstimationError(
@@ -136,8 +135,12 @@ def amplitude_density(values: VectorN, period: float) -> tuple[VectorM, VectorM]
             "slice_s"
         )
     length = min(max(run.size // SPECTRUM_STRETCHES, FEWEST_SAMPLES), LONGEST_STRETCH)
-    f, power = welch(run, fs=1.0 / period, window="hann", nperseg=length, detrend="constant")
-    return f[1:], np.sqrt(power[1:])
+    window, starts = welch.hann(length), welch.list_starts([slice(0, run.size)], length)
+    spectra = welch.transform(np.stack([run[start : start + length] for start in starts]), window)
+    density = np.mean(welch.square(spectra), axis=0) * (2.0 * period / np.sum(window**2))
+    if length % 2 == 0:
+        density[-1] *= 0.5  # the Nyquist frequency has no other side
+    return np.fft.rfftfreq(length, period)[1:], np.sqrt(density[1:])
 
 
 def _find_longest_run(values: VectorN) -> VectorM:
