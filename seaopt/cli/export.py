@@ -195,7 +195,7 @@ def _find_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -> float
 
     stored, *_ = read_laws(content)
     limit = options["command_limit"] if options["current_limit_A"] is None else options["current_limit_A"]
-    limit = choose_limit(stored["command"], stored["spec"], limit)
+    limit = choose_limit(stored.command, stored.spec, limit)
     return None if limit is None or not math.isfinite(limit) else limit
 
 
@@ -207,7 +207,7 @@ def _find_raised_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -
     from seaopt.control.scheduling.stored import read_laws  # deferred: pydantic
 
     stored, *_ = read_laws(content)
-    return find_raised_limit(stored["command"], stored["spec"], limits[0])
+    return find_raised_limit(stored.command, stored.spec, limits[0])
 
 
 def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tuple[Path, ...]:

@@ -18,7 +18,6 @@ from seaopt.cli.session import SCHEMAS, Session
 from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
-from seaopt.control.laws.stored import read_controller
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json, write_text
 from seaopt.logs import write_log
@@ -146,10 +145,9 @@ def _find_others(folder: Path, own: Path, controller: Controller) -> dict[str, C
         if path == own or not path.is_file():
             continue
         try:
-            stored = read_controller(read_json(path, SCHEMAS["tune"]))
+            others[str(path.relative_to(folder))] = Controller.read(read_json(path, SCHEMAS["tune"]))
         except SeaoptError:  # another kind of file, or of another version
             continue
-        others[str(path.relative_to(folder))] = Controller(**stored, achieved=controller.achieved)
     return others
 
 

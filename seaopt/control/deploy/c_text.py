@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from seaopt.control.laws.command import Command
-from seaopt.control.laws.delay import describe_delays
 from seaopt.errors import ControlError
 
 if TYPE_CHECKING:
@@ -91,16 +90,3 @@ def _make_environment() -> Environment:
 def name_unit(command: Command) -> str:
     """Return the unit of the reference as a part of names in C."""
     return re.sub("[^A-Za-z0-9]+", "_per_", command.reference_unit.replace(" ", "")).strip("_")
-
-
-def describe_timing(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what files say of the delays of a stored controller."""
-    computing, drive, period = stored["compute_delay_samples"], stored["drive_delay_s"], stored["sample_time_s"]
-    older = stored["spec"].delay_samples is not None
-    return {
-        "compute_delay_samples": computing,
-        "drive_delay_s": repr(float(drive)),
-        "drive_delay_ms": f"{1e3 * drive:.4g}" if drive else "",
-        "older": older,
-        "delays": describe_delays(computing, drive, period, older=older),
-    }

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal
@@ -22,7 +22,6 @@ from seaopt.control.deploy.c_text import (
     LARGEST_NUMBER,
     Precision,
     check_prefix,
-    describe_timing,
     identifier,
     literal,
     name_unit,
@@ -41,7 +40,7 @@ from seaopt.control.deploy.target import (
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
-from seaopt.control.laws.realisation import RunnableLaw, check_guards, choose_limit, find_raised_limit, realise, wind_up
+from seaopt.control.laws.realisation import RunnableLaw, check_guards, find_raised_limit, runnable
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.laws.verdict import join_labels
@@ -49,7 +48,6 @@ from seaopt.control.loops.compensation.link_feedforward import multiply_out
 from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE, RippleTerm
 from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import ControlError, FileError, require_type
@@ -156,24 +154,18 @@ def export(
         templates, kind = SCHEDULE_TEMPLATES, "schedule"
     else:
         stored, figures, heat = _read(content)
-        templates, missed, met, kind = TEMPLATES, join_labels(stored["active_constraints"]), stored["met"], "controller"
-        law = realise(
-            **wind_up(stored, tracking_time_s),
-            per_effort=stored["command"].per_effort,
-            command_limit=choose_limit(stored["command"], stored["spec"], limit),
-            command=(stored["command"].input, stored["command"].unit),
-            compensation=stored["compensation"],
-        )
+        templates, missed, met, kind = TEMPLATES, join_labels(stored.active_constraints), stored.met, "controller"
+        law = runnable(stored, command_limit=limit, tracking_time_s=tracking_time_s, gate=False, heat=False)
     heat = derate if isinstance(derate, HeatGuard) else heat
-    derate = stored["derate"] if derate is None else derate
+    derate = stored.derate if derate is None else derate
     if derate and heat is None:
         raise ControlError(
             "derate = True, but nothing is known of the motor's heat; tune on a plant with the part thermal that "
             "is commanded a current"
         )
-    gate = stored["gate"] if gate is None else None if gate is False else gate
+    gate = stored.gate if gate is None else None if gate is False else gate
     heat = heat if derate else None
-    check_guards(gate, heat, (stored["command"].input, stored["command"].unit))
+    check_guards(gate, heat, law.command)
     law = replace(law, gate=gate, heat=heat)
     words = _describe(stored, law) | {
         "achieved": figures,
@@ -194,17 +186,17 @@ def export(
         "NAME": prefix.upper(),
         "precision": precision,
         "fit_met": fit_met,
-        "raised_from": strip_markup(find_raised_limit(stored["command"], stored["spec"], limit)),
+        "raised_from": strip_markup(find_raised_limit(stored.command, stored.spec, limit)),
     }
     templates = dict(templates)
     if log_rows is not None:
-        names = tuple(dict.fromkeys((*_list_signals(stored), *law.further)))
-        units, digest = _list_units(controller, stored), hash_law(law, stored["outer"])
+        names = tuple(dict.fromkeys((*stored.signals, *law.further)))
+        units, digest = _list_units(stored), hash_law(law, stored.outer)
         context |= describe_log(context, law, names, log_rows, units=units, digest=digest)
         templates |= LOG_TEMPLATES
     if tare is not None:
         require_type(tare, Tare, "tare", "give a Tare", ControlError)
-        unit_after = strip_markup(f" {stored['command'].reference_unit}")
+        unit_after = strip_markup(f" {stored.command.reference_unit}")
         context |= {"tare": describe_tare(tare, law.sample_time_s), "unit_after": unit_after}
         templates |= TARE_TEMPLATES
     texts = {
@@ -214,19 +206,16 @@ def export(
     return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
 
 
-def _read(controller: Controller | Mapping[str, Any]) -> tuple[dict[str, Any], list[str], HeatGuard | None]:
-    """Return the fields of a controller, the lines on its figures, and its heat guard."""
+def _read(controller: Controller | Mapping[str, Any]) -> tuple[Controller, list[str], HeatGuard | None]:
+    """Return a controller, the lines on its figures, and its heat guard."""
     if isinstance(controller, Controller):
-        stored = {field.name: getattr(controller, field.name) for field in fields(Controller)}
-        return stored, _figures(controller), controller.heat_guard
-    from seaopt.control.laws.stored import read_controller  # deferred: pydantic
-
+        return controller, _figures(controller), controller.heat_guard
     if "mpc" in controller:
         raise ControlError(
             "the controller plans, and its law here is that of no active limit; write its C code with export_mpc, or "
             "type seaopt export DIR"
         )
-    return read_controller(controller), _stated(controller), read_guard(controller)
+    return Controller.read(controller), _stated(controller), read_guard(controller)
 
 
 def read_guard(content: Mapping[str, Any], margin_K: float = 0.0) -> HeatGuard | None:
@@ -275,29 +264,28 @@ def _format_figures(whence: str, achieved: Mapping[str, Any]) -> list[str]:
     return [f"{whence}: {', '.join(parts) or 'nothing that was measured'}."]
 
 
-def _describe(stored: Mapping[str, Any], law: RunnableLaw | RunnableSchedule) -> dict[str, Any]:
+def _describe(stored: Controller, law: RunnableLaw | RunnableSchedule) -> dict[str, Any]:
     """Return what the files say in words."""
-    command = stored["command"]
+    command, drive, outer = stored.command, stored.drive_delay_s, stored.outer
     return {
-        "structure": strip_markup(stored["structure"]),
-        "measured": strip_markup(", ".join(_list_signals(stored))),
-        "effort": stored["command"].mechanics.word,
+        "structure": strip_markup(stored.structure),
+        "measured": strip_markup(", ".join(stored.signals)),
+        "effort": command.mechanics.word,
         "command": {name: strip_markup(getattr(command, name)) for name in ("word", "unit", "effort_unit")},
         "symbol": command.symbol,
         "LIMIT": command.limit_symbol,
         "suffix": name_unit(command),
         "rate_hz": f"{1.0 / law.sample_time_s:.10g}",
-        **describe_timing(stored),
+        "compute_delay_samples": stored.compute_delay_samples,
+        "drive_delay_s": repr(float(drive)),
+        "drive_delay_ms": f"{1e3 * drive:.4g}" if drive else "",
+        "older": stored.spec.delay_samples is not None,
+        "delays": stored.delays,
         "limited": math.isfinite(law.command_limit),
         "scheduled": isinstance(law, RunnableSchedule),
         "gated": law.gate is not None,
         "heated": law.heat is not None,
-        "outer_units": {}
-        if stored["outer"] is None
-        else {
-            "stiffness": mechanics_of(stored["outer"].place_unit).stiffness,
-            "damping": mechanics_of(stored["outer"].place_unit).damping,
-        },
+        "outer_units": None if outer is None else mechanics_of(outer.place_unit),
         "max_held": law.gate.max_held if law.gate is not None else 0,
     }
 
@@ -322,30 +310,26 @@ def _write_gate(gate: PlausibilityGate, sample_time_s: float, number: Callable[[
     }
 
 
-def _list_signals(stored: Mapping[str, Any]) -> tuple[str, ...]:
-    return stored["reads"] or list_names(stored["spec"].measured)
-
-
-def _list_units(controller: Any, stored: Mapping[str, Any]) -> dict[str, str]:
+def _list_units(stored: Controller) -> dict[str, str]:
     """Return the units of what a law reads, as far as its design plant, or what it is stored with, tells them."""
-    gate, link, terms = stored["gate"], stored["link"], stored["compensation"]
+    gate, link, terms = stored.gate, stored.link, stored.compensation
     parts = () if terms is None else (terms.gravity, terms.ripple)
     units = {part.reads: part.unit for part in parts if part is not None}
     if link is not None:
         units[link.measured] = link.unit
     if gate is not None and gate.agreement is not None:
         units |= dict(zip(gate.reads, gate.agreement.units, strict=False))
-    if isinstance(controller, Controller) and controller.design is not None:
-        units |= controller.see(controller.design[0]).outputs
-    return units | {_list_signals(stored)[0]: stored["command"].reference_unit}
+    if stored.design is not None:
+        units |= stored.see(stored.design[0]).outputs
+    return units | {stored.signals[0]: stored.command.reference_unit}
 
 
 def _write_numbers(
-    stored: Mapping[str, Any], law: RunnableLaw | RunnableSchedule, number: Callable[[float], str], precision: Precision
+    stored: Controller, law: RunnableLaw | RunnableSchedule, number: Callable[[float], str], precision: Precision
 ) -> dict[str, Any]:
     """Return what surrounds any law as text: what it reads, limits, guards, terms, outer loop."""
-    others = [strip_markup(name) for name in _list_signals(stored)[1:]]
-    added = stored["compensation"] or Compensation(sample_time_s=law.sample_time_s)
+    others = [strip_markup(name) for name in stored.signals[1:]]
+    added = stored.compensation or Compensation(sample_time_s=law.sample_time_s)
     largest = float(LARGEST_NUMBER[precision])
     return {
         "more": [
@@ -362,13 +346,13 @@ def _write_numbers(
         "effort_limit": number(min(law.force_limit_N, largest)),
         "command_limit": number(min(law.command_limit, largest)),
         "per_effort": number(law.per_effort),
-        "per_effort_unit": stored["command"].per_effort_unit,
+        "per_effort_unit": stored.command.per_effort_unit,
         "sample_time_s": number(law.sample_time_s),
         "gate": {} if law.gate is None else _write_gate(law.gate, law.sample_time_s, number),
         "heat": {} if law.heat is None else {name: repr(value) for name, value in asdict(law.heat).items()},
         "hottest": "" if law.heat is None else f"{law.heat.ambient + law.heat.allowed_rise:g}",
         "ambient": "" if law.heat is None else f"{law.heat.ambient:g}",
-        "outer": {} if stored["outer"] is None else _write_outer(stored["outer"], number),
+        "outer": {} if stored.outer is None else _write_outer(stored.outer, number),
         "friction": {} if added.friction is None else _write_friction(added.friction, added.sample_time_s, number),
         "gravity": {} if added.gravity is None else _write_gravity(added.gravity, number),
         "ripple": {} if added.ripple is None else _write_ripple(added.ripple, number),
@@ -380,21 +364,21 @@ def _write_numbers(
     }
 
 
-def _numbers(stored: Mapping[str, Any], law: RunnableLaw, number: Callable[[float], str]) -> dict[str, Any]:
+def _numbers(stored: Controller, law: RunnableLaw, number: Callable[[float], str]) -> dict[str, Any]:
     """Return the numbers of one law as text; a law without states is given one that stays zero."""
 
     def row(values: Iterable[float]) -> str:
         return ", ".join(number(float(value)) for value in values) or number(0.0)
 
     per_reference, per_measurement = law.rest()
-    transfer_functions = multiply_out(stored["law"], stored["link"])
+    transfer_functions = multiply_out(stored.law, stored.link)
     b, d, rest = (
         np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
     )
-    others = list(map(identifier, _list_signals(stored)[1:]))
+    others = list(map(identifier, stored.signals[1:]))
     added = law.compensation or Compensation(sample_time_s=law.sample_time_s)
     at_rest = added.gravity, added.ripple if law.integrators else None  # without an integral no effort is set
-    units = name_gain_units(stored["command"])
+    units = name_gain_units(stored.command)
     return {
         "order": law.c.size,
         "storage": max(law.c.size, 1),
@@ -415,7 +399,7 @@ def _numbers(stored: Mapping[str, Any], law: RunnableLaw, number: Callable[[floa
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
             {"name": identifier(key), "value": number(float(value)), "unit": units.get(key, "-")}
-            for key, value in stored["gains"].items()
+            for key, value in stored.gains.items()
         ],
         "resets": [
             f"read_{identifier(name)}"

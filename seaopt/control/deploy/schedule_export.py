@@ -17,13 +17,12 @@ import numpy as np
 from seaopt.control.deploy.c_text import identifier, name_unit, strip_markup
 from seaopt.control.deploy.trace import Term, Trace
 from seaopt.control.laws.command import name_gain_units
-from seaopt.control.laws.realisation import choose_limit
+from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.structures import AGREES
 from seaopt.control.loops.compensation.terms import Compensation, compensate
-from seaopt.control.loops.sampled_plant import list_names
-from seaopt.control.scheduling.gain_table import CORNERS, GainTable
-from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable, name_terms
-from seaopt.control.scheduling.scheduled_controller import is_alike
+from seaopt.control.scheduling.gain_table import CORNERS
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, name_terms
+from seaopt.control.scheduling.scheduled_controller import ScheduledController, is_alike
 from seaopt.control.scheduling.step_order import SHARE
 from seaopt.errors import FileError
 
@@ -33,54 +32,42 @@ WARPED = "tan(pi f T)"  # the unit of a corner in the table, in words
 
 def read_runnable(
     content: Mapping[str, Any], limit: float | None = None, tracking_time_s: float | None = None
-) -> tuple[RunnableSchedule, dict[str, Any]]:
-    """Return the law of a schedule's controller.json, ready to run, and the fields of its first controller. Raises
-    ControlError, FileError.
+) -> tuple[RunnableSchedule, Controller]:
+    """Return the law of a schedule's controller.json, ready to run, and its first controller. Raises ControlError,
+    FileError.
     """
     from seaopt.control.scheduling.stored import read_points  # deferred: pydantic
 
-    table, _, (first, *further) = read_points(content)
-    controllers, command = [first, *further], first["command"]
-    if not all(is_alike(each["compensation"], first["compensation"]) for each in further):
+    table, _, controllers = read_points(content)
+    first = controllers[0]
+    if not all(is_alike(each.compensation, first.compensation) for each in controllers):
         raise FileError("controller.json: terms are not alike at all points; tune again")
-    law = make_runnable(
-        GainTable(
-            over=table.over,
-            unit=table.unit,
-            points=np.array(table.points),
-            gains={name: np.array([each["gains"][name] for each in controllers]) for name in first["gains"]},
-            structure=first["structure"],
-            sample_time_s=first["sample_time_s"],
-            links=tuple(each["link"] for each in controllers if each["link"] is not None),
-            nominals=tuple(each["observer"].nominal for each in controllers if each["observer"] is not None),
-            speed=first["spec"].find_speed_loop(first["reads"] or list_names(first["spec"].measured)),
-        ),
-        per_effort=command.per_effort,
-        limit=choose_limit(command, first["spec"], limit),
+    schedule = ScheduledController(
+        over=table.over,
+        unit=table.unit,
+        points=table.points,
+        controllers=tuple(controllers),
+        others={},
         fallback=table.fallback,
-        tracking_time_s=tracking_time_s,
-        command=(command.input, command.unit),
-        compensations=[each["compensation"] for each in controllers],
     )
+    law = schedule.runnable(limit=limit, tracking_time_s=tracking_time_s)
     if tracking_time_s is None and not np.allclose(law.anti_windup, table.anti_windup, rtol=AGREES, atol=0.0):
         raise FileError("controller.json: schedule.anti_windup is not what the gains give; tune again")
     return law, first
 
 
-def describe_schedule(
-    law: RunnableSchedule, first: Mapping[str, Any], number: Callable[[float], str]
-) -> dict[str, Any]:
+def describe_schedule(law: RunnableSchedule, first: Controller, number: Callable[[float], str]) -> dict[str, Any]:
     """Return words and numbers of the table, and the step traced."""
     table = law.table
-    units = name_gain_units(first["command"]) | dict.fromkeys(CORNERS.values(), WARPED)
+    units = name_gain_units(first.command) | dict.fromkeys(CORNERS.values(), WARPED)
     rows = {**table.columns, SHARE: law.anti_windup, **_list_varying(law)}
-    signals = [f"read_{identifier(name)}" for name in (first["reads"] or list_names(first["spec"].measured))[1:]]
+    signals = [f"read_{identifier(name)}" for name in first.signals[1:]]
     terms = law.compensation or Compensation(sample_time_s=law.sample_time_s)
     integrators = table.integrates or "T_v" in table.gains or bool(table.nominals)
     at_rest = {term.reads for term in (terms.gravity, terms.ripple if integrators else None) if term is not None}
     resets = [f"read_{identifier(name)}" for name in terms.reads if name in at_rest]
     return {
-        **_trace(law, f"reference_{name_unit(first['command'])}", list(rows), signals, number),
+        **_trace(law, f"reference_{name_unit(first.command)}", list(rows), signals, number),
         "integrators": integrators,
         "resets": [name for name in resets if name not in signals],
         "over": strip_markup(table.over),

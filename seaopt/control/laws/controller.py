@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from seaopt.codec import to_content
 from seaopt.control.laws.command import Command, actuation_notes, limit_notes, name_rates
-from seaopt.control.laws.delay import LoopDelays, place_drive_delay
+from seaopt.control.laws.delay import LoopDelays
 from seaopt.control.laws.limits import MeasuredLoop, PortFigures
 from seaopt.control.laws.plausibility import PlausibilityGate, list_further
 from seaopt.control.laws.spec import ControllerSpec
@@ -26,7 +26,7 @@ from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_figures,
 from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath, multiply_out
 from seaopt.control.loops.compensation.terms import Compensation
-from seaopt.control.loops.friction_loop import make_friction_loops
+from seaopt.control.loops.friction_loop import FrictionLoop, make_friction_loops
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.figures import MeasuredFigures
@@ -55,6 +55,7 @@ SCALE = (5e-3, 5.0)  # by which a reading is off, from and up to: play at rest i
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 ARRIVAL_PERIODS, NOT_ARRIVED = 20.0, 0.05  # of the bandwidth, after which a step is to be nearer than this share
 _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
+_UNKNOWN = LoopFigures(stable=False, spectral_radius=np.nan)
 
 
 @record(eq=False, repr=False)
@@ -462,6 +463,11 @@ class Controller(LoopDelays, Result, Worded):
         return {} if self.prefilter is None else {WITHOUT_PREFILTER: self.bandwidth_without_prefilter_hz}
 
     @classmethod
+    def read(cls, content: Mapping[str, Any]) -> Controller:
+        """Return the controller of a controller.json, without its design plant and what it achieves there."""
+        return cls(**read_controller(content), achieved=_UNKNOWN)
+
+    @classmethod
     def from_dict(cls, content: Mapping[str, Any], plant: Plant | MeasuredResponse, params: ParameterSet) -> Controller:
         """Return the controller of a controller.json; what it achieves is computed again on the design plant.
 
@@ -469,33 +475,28 @@ class Controller(LoopDelays, Result, Worded):
         Raises FileError: a field is missing or malformed, or one contradicts the law: gains, reference, measurement,
         achieved.
         """
-        stored = read_controller(content)
-        spec, command, law = stored["spec"], stored["command"], stored["law"]
-        design = friction = None
+        controller = cls.read(content)
+        spec, command = controller.spec, controller.command
         if isinstance(plant, MeasuredResponse):
-            achieved = DiscLoop(plant=spec.see_response(plant, command), law=law).figures(spec.bandwidth_hz)
+            loop = DiscLoop(plant=spec.see_response(plant, command), law=controller.law)
             command = replace(command, largest=find_range(plant.plant, params))
+            controller = replace(controller, command=command, achieved=loop.figures(spec.bandwidth_hz))
         else:
-            design_plant = plant
-            if stored["link"] is not None:
-                check_link(stored["link"], spec, plant)
-                design_plant = stored["link"].see(plant)
-            unit = design_plant.outputs.get(spec.regulated, "")
+            if controller.link is not None:
+                check_link(controller.link, spec, plant)
+            plant = controller.see(plant)
+            unit = plant.outputs.get(spec.regulated, "")
             unit = "" if unit == command.effort_unit else unit
-            command = replace(command, largest=find_range(design_plant, params), measured_unit=unit)
-            params = place_drive_delay(spec, params, stored["drive_delay_s"])
-            reads, waits = stored["reads"] or list_names(spec.measured), stored["compute_delay_samples"]
-            sliding, gain = take_sliding(design_plant, params), command.per_effort
-            achieved = Loop(plant=sample(sliding, params, reads, gain, law.sample_time_s, waits), law=law).figures()
-            (loop,) = make_friction_loops(design_plant, [params], reads, gain, waits, law)
-            friction = None if loop is None else friction_margin(loop)
-            design = design_plant, params
-        check_achieved(content.get("achieved"), _list_achieved(achieved))
-        check_friction_margin(content["achieved"].get(FRICTION_MARGIN), friction)
-        controller = cls(**stored | {"command": command}, achieved=achieved, design=design, friction=friction)
+            command = replace(command, largest=find_range(plant, params), measured_unit=unit)
+            design = plant, controller.delay(params)
+            controller = replace(controller, command=command, design=design)
+            figures, friction = controller.close(*design).figures(), find_friction_margin(controller, *design)
+            controller = replace(controller, achieved=figures, friction=friction)
+        check_achieved(content.get("achieved"), _list_achieved(controller.achieved))
+        check_friction_margin(content["achieved"].get(FRICTION_MARGIN), controller.friction)
         check_achieved(content["achieved"], controller._prefilter_figures())
         loops = [controller.design_loop]
-        if design is not None:
+        if controller.design is not None:
             states = controller.measure_states().items()
             first, *stuck = (controller.measure(f"design plant{state}", figures) for state, figures in states)
             loops = [controller._add_friction(first), *stuck]
@@ -509,6 +510,31 @@ class Controller(LoopDelays, Result, Worded):
         _, *sticking = split_friction({"": plant}, params).items()
         stuck = {name: Loop(plant=self.plant(model, params), law=self.law).figures() for name, model in sticking}
         return {" sliding" if stuck else "": self.achieved} | stuck
+
+
+def find_friction_margin(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
+    """Return how much steeper friction may be with stability shown, between the samples too; None without friction. The
+    linear plant is the sliding one; what a curve's slope is above its flattest is in the sector. The controller's
+    measurement path closes the loop; the reference stands still; `params` may hold conditions. The factor is zero where
+    the sliding loop is unstable, has an `obstacle` (`FrictionLoop`), or nothing was shown, which does not show an
+    oscillation.
+    """
+    return find_friction_margins(controller, plant, [params])[0]
+
+
+def find_friction_margins(
+    controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
+) -> list[FrictionMargin | None]:
+    """Return `find_friction_margin` at sets of parameters with the same conditions; see `friction_margin`."""
+    loops = take_friction_out(controller, plant, sets)
+    return [None if loop is None else friction_margin(loop, first, least) for loop in loops]
+
+
+def take_friction_out(controller: Controller, plant: Plant, sets: Sequence[ParameterSet]) -> list[FrictionLoop | None]:
+    """Return `make_friction_loops` of a controller."""
+    late, gain = [controller.delay(params) for params in sets], controller.command.per_effort
+    waits = controller.compute_delay_samples
+    return make_friction_loops(plant, late, controller.signals, gain, waits, controller.law)
 
 
 def _list_achieved(figures: LoopFigures) -> dict[str, Any]:

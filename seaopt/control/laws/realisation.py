@@ -421,9 +421,8 @@ def runnable(
     >>> round(current, 6)
     9.0
     """
-    parts = {name: getattr(controller, name) for name in ("law", "share", "gains", "observer", "link", "spec")}
     law = realise(
-        **wind_up(parts, tracking_time_s),
+        **_wind_up(controller, tracking_time_s),
         per_effort=controller.command.per_effort,
         command_limit=choose_limit(controller.command, controller.spec, command_limit),
         command=(controller.command.input, controller.command.unit),
@@ -434,11 +433,11 @@ def runnable(
     return replace(law, outer=controller.outer) if outer else law
 
 
-def wind_up(controller: Mapping[str, Any], tracking_time_s: float | None) -> dict[str, Any]:
-    """Return what `realise` takes of a controller's law and anti-windup, from its fields: of a schedule's law, frozen,
-    as the schedule winds up there. Raises ControlError: a tracking time is given beside its share.
+def _wind_up(controller: Controller, tracking_time_s: float | None) -> dict[str, Any]:
+    """Return what `realise` takes of a controller's law and anti-windup: of a schedule's law, frozen, as the schedule
+    winds up there. Raises ControlError: a tracking time is given beside its share.
     """
-    law, share = controller["law"], controller["share"]
+    law, share = controller.law, controller.share
     if share is None:
         return {"law": law, "tracking_time_s": tracking_time_s}
     if tracking_time_s is not None:
@@ -446,10 +445,10 @@ def wind_up(controller: Mapping[str, Any], tracking_time_s: float | None) -> dic
             f"tracking_time_s = {tracking_time_s:g}: the law is a schedule's, frozen, and winds up as that does; leave "
             "it out"
         )
-    excess = controller["observer"] is not None
+    excess = controller.observer is not None
     if excess:
-        gains = Gains.from_names(controller["gains"], controller["observer"], link=controller["link"])
-        law = gains.law(controller["spec"].structure, law.sample_time_s, share).balanced()
+        gains = Gains.from_names(controller.gains, controller.observer, link=controller.link)
+        law = gains.law(controller.spec.structure, law.sample_time_s, share).balanced()
     tracking_time_s = law.sample_time_s * (1.0 / share - 1.0) if share else None
     return {"law": law, "tracking_time_s": tracking_time_s, "excess": excess}
 

@@ -14,6 +14,7 @@ import numpy as np
 from seaopt.codec import OrInfinite, to_content
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.realisation import choose_limit
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.control.loops.compensation.terms import Compensation
@@ -294,7 +295,7 @@ def _make_runnable(
     law = make_runnable(
         schedule.table,
         per_effort=schedule.command.per_effort,
-        limit=first.command_limit if limit is None else schedule.command.limit(limit),
+        limit=choose_limit(schedule.command, schedule.spec, limit),
         fallback=schedule.fallback,
         tracking_time_s=tracking_time_s,
         command=(schedule.command.input, schedule.command.unit),

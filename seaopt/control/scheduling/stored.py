@@ -8,6 +8,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from seaopt.codec import Constraints, from_content, join_schemas
+from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.stored import (
     FILE,
     TUNE_AGAIN,
@@ -17,7 +18,6 @@ from seaopt.control.laws.stored import (
     StoredLoop,
     StoredNumber,
     Terms,
-    read_controller,
 )
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.measured.figures import MeasuredFigures
@@ -62,11 +62,11 @@ class StoredSchedule(StoredLoop):
 
 
 class Points(NamedTuple):
-    """A schedule as its file has it: its points, and at each the content and the fields of a controller."""
+    """A schedule as its file has it: its points, and at each the content of a controller, and the controller."""
 
     table: StoredPoints
     contents: list[dict[str, Any]]
-    controllers: list[dict[str, Any]]
+    controllers: list[Controller]
 
 
 def read_points(content: Mapping[str, Any]) -> Points:
@@ -98,18 +98,18 @@ def read_points(content: Mapping[str, Any]) -> Points:
         }
         for k in range(len(table.points))
     ]
-    controllers: list[dict[str, Any]] = []
+    controllers: list[Controller] = []
     for point, each in zip(table.points, contents, strict=True):
         try:
-            controllers.append(read_controller(each))
+            controllers.append(Controller.read(each))
         except FileError as error:
             raise FileError(f"at {table.over} = {point:g}, {error}") from error
     return Points(table, contents, controllers)
 
 
-def read_laws(content: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the fields of the controllers in a controller.json: of a law one, of a schedule one for each point."""
-    return read_points(content).controllers if content.get("schedule") else [read_controller(content)]
+def read_laws(content: Mapping[str, Any]) -> list[Controller]:
+    """Return the controllers in a controller.json: of a law one, of a schedule one for each point."""
+    return read_points(content).controllers if content.get("schedule") else [Controller.read(content)]
 
 
 def controller_schema() -> dict[str, Any]:

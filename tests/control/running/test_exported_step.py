@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import subprocess
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -203,7 +203,7 @@ def export_all(compiler, parts, controller, folder, monkeypatch):
             reads=("F", "G", "H")[: law.measured], command=command, outer=outer,
         )  # fmt: skip
         if scheduled:
-            monkeypatch.setattr(export_module, "read_runnable", lambda *_, law=law, of=stored: (law, dict_of(of)))
+            monkeypatch.setattr(export_module, "read_runnable", lambda *_, law=law, of=stored: (law, of))
             stored = {"schedule": {"broken": []}, "feasible": True}
         limit = law.command_limit
         export(stored, folder, name=name, gate=law.gate or False, derate=law.heat or False, command_limit=limit)
@@ -227,10 +227,6 @@ def export_all(compiler, parts, controller, folder, monkeypatch):
         return out
 
     return play
-
-
-def dict_of(controller):
-    return {field.name: getattr(controller, field.name) for field in fields(controller)}
 
 
 @pytest.mark.parametrize("count", [20, pytest.param(400, marks=pytest.mark.slow)])
