@@ -44,10 +44,10 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.errors import ControlError
 from seaopt.records import record
 
-Frequencies = Float[np.ndarray, " m"]
 Coefficients = Float[np.ndarray, " n"]
 FUNCTIONS = 40
 SLOW_POLES = 12  # exponentials, from the slowest to the bandwidth
@@ -104,10 +104,10 @@ class _Terms:
     """What Q is a sum of, and the plant, at frequencies."""
 
     f: Frequencies
-    p: Complex[np.ndarray, " m"]
+    p: Response
     basis: Complex[np.ndarray, "m n"]
 
-    def s(self, x: Coefficients) -> Complex[np.ndarray, " m"]:
+    def s(self, x: Coefficients) -> Response:
         """Return S."""
         return 1.0 - self.p * (self.basis @ x)
 

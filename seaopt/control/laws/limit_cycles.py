@@ -18,11 +18,12 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex
 
 from seaopt.control.laws.controller import Controller, take_friction_out
 from seaopt.control.loops.crossings import find_crossings
 from seaopt.control.loops.friction_loop import FUNDAMENTAL, FrictionLoop
+from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import friction_slopes, remembers
@@ -45,9 +46,7 @@ class LimitCycle:
     state: tuple[float, ...]  # the plant's states at the cycle's largest friction velocity
 
 
-def describe_friction(
-    plant: Plant, params: ParameterSet, name: str, amplitude: Float[np.ndarray, " m"]
-) -> Float[np.ndarray, " m"]:
+def describe_friction(plant: Plant, params: ParameterSet, name: str, amplitude: Frequencies) -> Frequencies:
     """Return the describing function N (N s/m) of a friction above its flattest slope, at velocity amplitudes."""
     values = plant.complete(params)
     flattest = friction_slopes(plant, values)[0][list(plant.friction).index(name)]
@@ -105,7 +104,7 @@ def _find_crossings(loop: FrictionLoop, port: int) -> list[float]:
     return crossings[np.real(_respond(loop, port, crossings)[0]) < 0.0].tolist()
 
 
-def _find_amplitudes(gains: Float[np.ndarray, " m"], wanted: float) -> list[float]:
+def _find_amplitudes(gains: Frequencies, wanted: float) -> list[float]:
     """Return the amplitudes at which the describing function is a value, on straight lines in logarithms."""
     level = np.log(np.maximum(gains, 1e-300)) - np.log(wanted)
     return [
@@ -114,9 +113,7 @@ def _find_amplitudes(gains: Float[np.ndarray, " m"], wanted: float) -> list[floa
     ]
 
 
-def _respond(
-    loop: FrictionLoop, port: int, f: Float[np.ndarray, " m"]
-) -> tuple[Complex[np.ndarray, " m"], Complex[np.ndarray, " m"], Complex[np.ndarray, "m n"]]:
+def _respond(loop: FrictionLoop, port: int, f: Frequencies) -> tuple[Response, Response, Complex[np.ndarray, "m n"]]:
     """Return velocity, measured output and states of a friction effort of 1 N at frequencies (Hz), the fundamentals."""
     theta = 2 * np.pi * f * loop.plant.sample_time_s
     opened = loop.respond(theta, FUNDAMENTAL, np.eye(loop.motor.size))

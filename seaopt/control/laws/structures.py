@@ -82,7 +82,7 @@ from seaopt.control.laws.assembly import Assembly, Columns
 from seaopt.control.loops.compensation.link_feedforward import LOWEST_HZ, LinkPath
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
 from seaopt.options import option
 from seaopt.records import record
 
@@ -206,7 +206,7 @@ class Nominal:
         """Its inverse at 0 Hz."""
         return math.prod(float(np.sum(part.num) / np.sum(part.den)) for part in self.inverse)
 
-    def inverse_response(self, f: Float[np.ndarray, " m"], sample_time_s: float) -> Complex[np.ndarray, " m"]:
+    def inverse_response(self, f: Frequencies, sample_time_s: float) -> Response:
         """Return A/(B_s B_u(1)) at frequencies in Hz."""
         return np.prod([part.response(f, sample_time_s) for part in self.inverse], axis=0)
 
@@ -294,7 +294,7 @@ class SpeedLoop:
 
     differenced: bool  # it is an encoder's position, and the law takes the difference over one sample
 
-    def sense(self, q: Complex[np.ndarray, " m"], sample_time_s: float) -> Complex[np.ndarray, " m"]:
+    def sense(self, q: Response, sample_time_s: float) -> Response:
         """Return the speed per what is read, at q = exp(-j omega T_s)."""
         return (1.0 - q) / sample_time_s if self.differenced else np.ones_like(q)
 

@@ -61,12 +61,16 @@ NO_FEEDBACK = 1e9  # weight where a multiplier shows nothing, whatever the feedb
 SIMPLEST = "circle"  # the multiplier that is 1
 WORTHWHILE = 0.9  # of the inverse: a multiplier that gains less is not looked at further
 
+AtAliases = Complex[np.ndarray, "m k"]
+ComplexTerms = Complex[np.ndarray, "a n"]
+RealTerms = Float[np.ndarray, "a n"]
+Mobility = Complex[np.ndarray, "m k p p"]
 Angles = Float[np.ndarray, " m"]
 Multiplier = Callable[[Complex[np.ndarray, "*n"]], Complex[np.ndarray, "*n"]]
 Places = slice | Int[np.ndarray, " a"]
 Test = Callable[[float, Places], Angles]  # of 1/kappa and which angles: positive where M (H + 1/kappa) is definite
 Terms = tuple[
-    Bool[np.ndarray, " a"], Float[np.ndarray, "a n"], Float[np.ndarray, "a n"], Complex[np.ndarray, "a n"]
+    Bool[np.ndarray, " a"], RealTerms, RealTerms, ComplexTerms
 ]  # where all D_k > 0, and at every alias what alpha, beta and gamma are the sums of
 TermsOf = Callable[[float, Places], Terms]
 EVERY = slice(None)
@@ -178,8 +182,8 @@ class LoopResponses:
     """
 
     theta: Angles
-    s: Complex[np.ndarray, "m k"]
-    mobility: Complex[np.ndarray, "m k p p"]
+    s: AtAliases
+    mobility: Mobility
     command: Complex[np.ndarray, "m k p"]
     sensed: Complex[np.ndarray, "m k p *y"]
     tail: Float[np.ndarray, " m"]
@@ -219,7 +223,7 @@ def _weigh(at: LoopResponses, multiplier: Multiplier) -> Test:
     return test
 
 
-def _form_terms(at: LoopResponses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
+def _form_terms(at: LoopResponses, weight: AtAliases) -> TermsOf:
     """Return what gives, for 1/kappa, where all D_k are positive, and the terms of alpha, beta and gamma there."""
     if at.mobility.shape[-1] == 1:
         return _form_terms_of_one(at, weight)
@@ -236,7 +240,7 @@ def _form_terms(at: LoopResponses, weight: Complex[np.ndarray, "m k"]) -> TermsO
     return form
 
 
-def _form_terms_of_one(at: LoopResponses, weight: Complex[np.ndarray, "m k"]) -> TermsOf:
+def _form_terms_of_one(at: LoopResponses, weight: AtAliases) -> TermsOf:
     """Return `_form_terms` where there is one friction: numbers, not matrices, and most of them for every 1/kappa."""
     mobility, slope = np.real(weight * at.mobility[..., 0, 0]), np.real(weight)
     command, sensed = weight * at.command[..., 0], at.sensed[..., 0]
@@ -250,17 +254,11 @@ def _form_terms_of_one(at: LoopResponses, weight: Complex[np.ndarray, "m k"]) ->
     return form
 
 
-def _square(values: Complex[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
+def _square(values: AtAliases) -> Float[np.ndarray, "m k"]:
     return np.real(values) ** 2 + np.imag(values) ** 2
 
 
-def _compare(
-    at: LoopResponses,
-    angles: Places,
-    alpha: Float[np.ndarray, "a n"],
-    beta: Float[np.ndarray, "a n"],
-    gamma: Complex[np.ndarray, "a n"],
-) -> Angles:
+def _compare(at: LoopResponses, angles: Places, alpha: RealTerms, beta: RealTerms, gamma: ComplexTerms) -> Angles:
     """Return |2 + gamma|^2 - alpha beta of the terms at the aliases, scaled, with what is beyond them against it. The
     terms fall like 1/omega^2: the rest of each sum is at most a multiple of its last term.
     """
@@ -270,9 +268,7 @@ def _compare(
     return (np.sign(least) * least**2 - product) / (4.0 + np.abs(product))
 
 
-def bound_rest(
-    at: LoopResponses, terms: Complex[np.ndarray, "a n"] | Float[np.ndarray, "a n"], angles: Places = EVERY
-) -> Angles:
+def bound_rest(at: LoopResponses, terms: ComplexTerms | RealTerms, angles: Places = EVERY) -> Angles:
     """Return a bound on what is beyond the last aliases of terms that fall like 1/omega^2."""
     reach = TAIL_GROWTH * at.order[angles] ** 2 * at.tail[angles]
     return reach * np.maximum(np.abs(terms[:, 0]), np.abs(terms[:, -1]))
@@ -392,9 +388,7 @@ def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: f
     return FeedbackLimit(plants=through + 0.5 * sums[:, 1:, 0].T, weights=np.moveaxis(root, 0, -1))
 
 
-def invert_mobility(
-    weight: Complex[np.ndarray, "m k"], mobility: Complex[np.ndarray, "m k p p"], inverse: float
-) -> tuple[Bool[np.ndarray, " m"], Complex[np.ndarray, "m k p p"]]:
+def invert_mobility(weight: AtAliases, mobility: Mobility, inverse: float) -> tuple[Bool[np.ndarray, " m"], Mobility]:
     """Return where all D_k are positive definite at a 1/kappa, and their inverses; the identity where not."""
     block = weight[..., None, None] * (mobility + inverse * np.eye(mobility.shape[-1]))
     block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))

@@ -42,7 +42,7 @@ from seaopt.control.loops.minimal import (
     split,
     split_integrators,
 )
-from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
 from seaopt.control.systems.block import COMMAND, EFFORT, REFERENCE, Block, name_readings
 from seaopt.control.systems.resolvent import Resolvent
 from seaopt.errors import ControlError
@@ -118,23 +118,23 @@ class Law:
         """The eigenvalues of `a`, those of the chain exactly 1."""
         return np.concatenate([np.ones(self.integrators), np.linalg.eigvals(self.rest[0])]).astype(complex)
 
-    def responses(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
+    def responses(self, f: Frequencies) -> Complex[np.ndarray, "k m"]:
         """Return u per reference and per measured signal at frequencies in Hz; very large at 0 where it integrates."""
         return self.evaluate(np.expm1(2j * np.pi * f * self.sample_time_s))
 
-    def reference_response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def reference_response(self, f: Frequencies) -> Response:
         """Return C_r at frequencies in Hz."""
         return self.responses(f)[0]
 
-    def measurement_response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def measurement_response(self, f: Frequencies) -> Response:
         """Return C_y of the first measured signal at frequencies in Hz."""
         return -self.responses(f)[1]
 
-    def feedback_responses(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "y m"]:
+    def feedback_responses(self, f: Frequencies) -> Complex[np.ndarray, "y m"]:
         """Return C_y of every measured signal at frequencies in Hz."""
         return -self.responses(f)[1:]
 
-    def evaluate(self, from_one: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
+    def evaluate(self, from_one: Response) -> Complex[np.ndarray, "k m"]:
         """Return u per reference and per measured signal at z = 1 + from_one."""
         m, resolvent = _factorise(self)
         distance = np.where(np.abs(from_one) < NEAREST_TO_ONE, NEAREST_TO_ONE, from_one)
@@ -396,7 +396,7 @@ def _is_same(law: Law, original: Law, share: float = RESPONSE_TOLERANCE) -> bool
     return bool(np.all(np.abs(response - wanted) <= share * size + ROUNDED * above + TINY))
 
 
-def _in_delay(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " m"]) -> TransferFunction:
+def _in_delay(num: Float[np.ndarray, " n"], den: Frequencies) -> TransferFunction:
     """Return a transfer function of z, descending powers, as one of q = 1/z."""
     num, den = np.trim_zeros(np.asarray(num, dtype=float), "f"), np.trim_zeros(np.asarray(den, dtype=float), "f")
     if num.size > den.size:

@@ -20,6 +20,7 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.peaks import HALF_POWER, TRACKING, find_extremes, find_least
 from seaopt.control.loops.response import ClosedLoop, close
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.formatting import format_number
 from seaopt.records import record
 
@@ -126,21 +127,21 @@ class Loop:
     plant: DigitalPlant
     law: Law
 
-    def open_loop(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def open_loop(self, f: Frequencies) -> Response:
         """Return L at frequencies in Hz."""
         return np.sum(self.plant.responses(f) * self.law.feedback_responses(f), axis=0)
 
-    def sensitivity(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def sensitivity(self, f: Frequencies) -> Response:
         """Return S = 1/(1 + L)."""
         return 1.0 / (1.0 + self.open_loop(f))
 
-    def tracking(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def tracking(self, f: Frequencies) -> Response:
         """Return F/F_ref."""
         plant = self.plant.responses(f)
         reference, *measured = self.law.responses(f)
         return plant[0] * reference / (1.0 - np.sum(plant * np.array(measured), axis=0))
 
-    def noise(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def noise(self, f: Frequencies) -> Response:
         """Return -F_m/noise = C_y S, the noise being on the first measured signal."""
         return self.law.measurement_response(f) / (1.0 + self.open_loop(f))
 
@@ -204,16 +205,16 @@ class Loop:
             x = system.a @ x + r * drive
         return out[:, 0], out[:, 1]
 
-    def grid(self) -> Float[np.ndarray, " m"]:
+    def grid(self) -> Frequencies:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
         return self._make_grid(self.eigenvalues())
 
-    def _make_grid(self, poles: Complex[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    def _make_grid(self, poles: Complex[np.ndarray, " n"]) -> Frequencies:
         """Return the grid, of the closed loop's eigenvalues."""
         base = np.geomspace(GRID_LOWEST_HZ, self.plant.nyquist_hz, 1200)
         return np.union1d(base, self.about(np.concatenate([np.linalg.eigvals(self.plant.a), poles])))
 
-    def about(self, poles: Complex[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    def about(self, poles: Complex[np.ndarray, " n"]) -> Frequencies:
         """Return frequencies that resolve poles, up to the Nyquist frequency, unsorted."""
         nyquist = self.plant.nyquist_hz
         f0 = np.abs(np.angle(poles)) / (2 * np.pi * self.plant.sample_time_s)
@@ -265,7 +266,7 @@ class Loop:
         if low >= high:
             return None
 
-        def room(f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        def room(f: Frequencies) -> Frequencies:
             return HALF_POWER * static * (bandwidth_hz / f) ** SHOULDER_FALL - np.abs(self.tracking(f))
 
         if room(np.array([low]))[0] < 0.0:

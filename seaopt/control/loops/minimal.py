@@ -36,7 +36,9 @@ NEAR_ONE = 1e-6  # a pole of matrices that is nearer to 1 is an integrator, wher
 TINY = 1e-300
 VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 
-
+Vector = Float[np.ndarray, " n"]  # coefficients of a polynomial, or a row of states
+Matrix = Float[np.ndarray, "n n"]
+Inputs = Float[np.ndarray, "n k"]
 Split = tuple[Float[np.ndarray, " m"], Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # g_1 ... g_m, Y and R
 
 
@@ -74,7 +76,7 @@ def refuse_slow_poles(name: str) -> ControlError:
     )
 
 
-def _count_roots_at_one(name: str, den: Float[np.ndarray, " n"]) -> int:
+def _count_roots_at_one(name: str, den: Vector) -> int:
     """Return how many roots at 1 a denominator has. A value p(1) of rounding alone is that of a root there, or the
     product of the distances of slow poles. What it is known to, over the value that is left without the root, is how
     far from 1 the root may lie.
@@ -89,9 +91,7 @@ def _count_roots_at_one(name: str, den: Float[np.ndarray, " n"]) -> int:
     return count
 
 
-def realise_rest(
-    parts: list[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]],
-) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+def realise_rest(parts: list[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> tuple[Matrix, Inputs, Vector]:
     """Return Y/R of all parts (Y, R) in observer form, each of its input: on shared states where R is the same, else
     side by side. The direct terms, Y at q = 0, are left out. The form is of polynomials in z - 1, in which slow poles
     have digits that they do not have in z, with its states scaled.
@@ -150,7 +150,7 @@ def has_response(
 
 
 def split_integrators(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"]
+    a: Matrix, b: Inputs, c: Vector
 ) -> Iterator[
     tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]
 ]:
@@ -193,9 +193,7 @@ def split_integrators(
         yield chain, far, into[m:], out[m:] + read @ link
 
 
-def read_companion(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"], d: Float[np.ndarray, " k"]
-) -> list[TransferFunction]:
+def read_companion(a: Matrix, b: Inputs, c: Vector, d: Float[np.ndarray, " k"]) -> list[TransferFunction]:
     """Return the transfer function of each input of a companion form, whose entries are coefficients; of others none.
     The coefficients may stand in the first or last row (controllable) or column (observable).
     """
@@ -211,7 +209,7 @@ def read_companion(
     return []
 
 
-def _scale(a: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+def _scale(a: Matrix) -> tuple[Matrix, Vector]:
     """Return a matrix with rows and columns of like norms, and each state's factor."""
     from scipy.linalg import matrix_balance  # deferred: scipy is slow to load
 
@@ -221,11 +219,11 @@ def _scale(a: Float[np.ndarray, "n n"]) -> tuple[Float[np.ndarray, "n n"], Float
     return scaled, scale
 
 
-def _has_root_at_one(polynomial: Float[np.ndarray, " n"], share: float) -> bool:
+def _has_root_at_one(polynomial: Vector, share: float) -> bool:
     return bool(abs(np.sum(polynomial)) <= share * np.sum(np.abs(polynomial)))
 
 
-def _shift(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _shift(polynomial: Vector) -> Vector:
     """Return the coefficients in z - 1 of a polynomial in z, descending powers."""
     out = polynomial.copy()
     for count in range(out.size, 0, -1):  # Horner's rule: what is left at z = 1 is the lowest coefficient
@@ -233,7 +231,7 @@ def _shift(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return out
 
 
-def _flip(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def _flip(polynomial: Vector) -> Vector:
     """Return the coefficients in 1 - q of a polynomial in q, or the other way."""
     out = np.zeros(polynomial.size)
     for value in polynomial[::-1]:  # Horner's rule; the last coefficient shifted out is zero
@@ -242,7 +240,7 @@ def _flip(polynomial: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return out
 
 
-def _expand(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " k"], terms: int) -> Float[np.ndarray, " terms"]:
+def _expand(num: Vector, den: Float[np.ndarray, " k"], terms: int) -> Float[np.ndarray, " terms"]:
     """Return the first terms of num/den in powers of 1 - q."""
     top, bottom = (np.concatenate([_flip(p), np.zeros(terms)]) for p in (num, den))
     out = np.zeros(terms)
@@ -252,7 +250,7 @@ def _expand(num: Float[np.ndarray, " n"], den: Float[np.ndarray, " k"], terms: i
 
 
 def balance(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n k"], c: Float[np.ndarray, " n"], gain: float
+    a: Matrix, b: Inputs, c: Vector, gain: float
 ) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m k"], Float[np.ndarray, " m"]]:
     """Return a stable system balanced and of least order. What is below `NEGLIGIBLE_HANKEL` of `gain`, or of the
     largest Hankel singular value, is rounding. Raises LinAlgError: a pole is so close to the unit circle that a Gramian
@@ -270,10 +268,10 @@ def balance(
     return back @ a @ into, back @ b, c @ into
 
 
-def _factor(a: Float[np.ndarray, "n n"], b: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n n"]:
+def _factor(a: Matrix, b: Float[np.ndarray, "n _"]) -> Matrix:
     """Return G with G G' = the sum of a^k b b' a^k' over k >= 0, never squared: small directions keep their digits."""
 
-    def triangle(wide: Float[np.ndarray, "n _"]) -> Float[np.ndarray, "n n"]:
+    def triangle(wide: Float[np.ndarray, "n _"]) -> Matrix:
         return np.asarray(np.linalg.qr(wide.T, mode="r")).T
 
     g = triangle(np.hstack([b, np.zeros(a.shape)]))

@@ -11,10 +11,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from seaopt.control.loops.response import ClosedLoop, Indices, find_arcs, find_sign_changes, find_zeros
+from seaopt.control.loops.response import Angles, ClosedLoop, Edges, Indices, find_arcs, find_sign_changes, find_zeros
 from seaopt.errors import ControlError
 from seaopt.records import record
 
+PerCurve = Float[np.ndarray, " c"]
+PerCrossing = Float[np.ndarray, " k"]
+PerFactor = Float[np.ndarray, " l"]
 HALF_POWER = 1.0 / np.sqrt(2.0)
 PROOF = 1e-7
 COARSE_ANGLES = np.concatenate([[0.0], np.pi * np.geomspace(1e-5, 1.0, 49)])
@@ -33,33 +36,33 @@ class Extremes:
 
     # peaks, at: largest values of S, T, S - T, C_y S and F/F_ref, of further measured signals C_y S, and the angles
     # where
-    peaks: Float[np.ndarray, " c"]
-    at: Float[np.ndarray, " c"]
+    peaks: PerCurve
+    at: PerCurve
     ends: Complex[np.ndarray, "c 2"]  # the curves at 0 and pi, shape (c, 2)
     static: float  # abs(F/F_ref) at 0; zero where a zero of the plant leaves nothing but rounding
     # crossovers, crossover_phases: where abs(L) = 1, and the phase of -L there (rad)
-    crossovers: Float[np.ndarray, " k"]
-    crossover_phases: Float[np.ndarray, " k"]
-    gain_factors: Float[np.ndarray, " l"]  # every positive factor on L that puts it through -1
-    gain_angles: Float[np.ndarray, " l"]  # where these factors do
+    crossovers: PerCrossing
+    crossover_phases: PerCrossing
+    gain_factors: PerFactor  # every positive factor on L that puts it through -1
+    gain_angles: PerFactor  # where these factors do
     # sensitivity_edges, bandwidth_edges, band_edges: where abs(S) is -3 dB, abs(F/F_ref) -3 dB of its static value, and
     # within 3 dB of 1 or not
-    sensitivity_edges: Float[np.ndarray, " m"]
+    sensitivity_edges: Angles
     bandwidth_edges: Float[np.ndarray, " n"]
     band_edges: Float[np.ndarray, " o"]
 
     @property
-    def gains_db(self) -> Float[np.ndarray, " l"]:
+    def gains_db(self) -> PerFactor:
         """The gain factors in dB: margins up positive, down negative."""
         return 20.0 * np.log10(self.gain_factors)
 
     @property
-    def lags_deg(self) -> Float[np.ndarray, " k"]:
+    def lags_deg(self) -> PerCrossing:
         """The phases at the crossovers in degrees: lag to -1 positive, lead negative."""
         return np.degrees(self.crossover_phases)
 
     @property
-    def delays(self) -> Float[np.ndarray, " k"]:
+    def delays(self) -> PerCrossing:
         """The delay, in samples, that each crossover's phase amounts to."""
         return np.mod(self.crossover_phases, 2 * np.pi) / self.crossovers
 
@@ -80,7 +83,7 @@ def find_extremes(system: ClosedLoop) -> Extremes:
     at_peaks = system.sensitivity(at[:3])
     peaks[:3] = np.abs([at_peaks[0], 1.0 - at_peaks[1], 2.0 * at_peaks[2] - 1.0])
 
-    def function(theta: Float[np.ndarray, " m"], which: Indices) -> Float[np.ndarray, " m"]:
+    def function(theta: Angles, which: Indices) -> Angles:
         values = system.curves(theta)
         rows = [2.0 * values[0].real - 1.0, values[0].imag]
         rows += [np.abs(values[k] / level) ** 2 - 1.0 for k, level in levels]
@@ -123,7 +126,7 @@ def find_least(system: ClosedLoop, curve: int, until: float) -> float:
         low = edges[:-1][values < least]
         high = edges[1:][values < least]
 
-        def fall(theta: Float[np.ndarray, " m"], _: Indices) -> Float[np.ndarray, " m"]:
+        def fall(theta: Angles, _: Indices) -> Angles:
             return system.differentiate(theta, np.full(theta.size, curve))[1]
 
         at_low, at_high = fall(low, np.arange(low.size)), fall(high, np.arange(low.size))
@@ -133,24 +136,22 @@ def find_least(system: ClosedLoop, curve: int, until: float) -> float:
     return least
 
 
-def find_crossovers(system: ClosedLoop) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+def find_crossovers(system: ClosedLoop) -> tuple[PerCrossing, PerCrossing]:
     """Return where abs(L) = 1, and the phase of -L there (rad); the loop need not be stable."""
 
-    def function(theta: Float[np.ndarray, " m"], _: Indices) -> Float[np.ndarray, " m"]:
+    def function(theta: Angles, _: Indices) -> Angles:
         return 2.0 * system.curves(theta)[0].real - 1.0
 
     (angles,) = find_sign_changes(function, find_arcs([system.equal()]))
     return angles, _phases(system, angles)
 
 
-def _phases(system: ClosedLoop, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+def _phases(system: ClosedLoop, theta: PerCrossing) -> PerCrossing:
     s, t = system.curves(theta)[:2]
     return np.angle(-t / s)
 
 
-def _gain_factors(
-    system: ClosedLoop, turns: Float[np.ndarray, " m"]
-) -> tuple[Float[np.ndarray, " l"], Float[np.ndarray, " l"]]:
+def _gain_factors(system: ClosedLoop, turns: Angles) -> tuple[PerFactor, PerFactor]:
     """Return the factors -1/L at angles where L is real and negative, and these angles. A pole of L on the circle, an
     integrator at angle 0, is no crossing, and a zero is none: what -1/L has there is rounding. A pole is on the circle
     if it is no further from it than it is known; next to a light mode, which is off it, a crossing is one.
@@ -167,7 +168,7 @@ def _gain_factors(
     return factors[crossing], turns[crossing]
 
 
-def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+def _find_candidates(system: ClosedLoop) -> tuple[PerCurve, PerCurve]:
     """Return the largest values on a coarse grid and at the poles, the best of each curve refined."""
     modes = np.abs(np.angle(system.poles))
     theta = np.unique(np.concatenate([COARSE_ANGLES, modes[modes > 1e-9]]))
@@ -188,18 +189,18 @@ def _find_candidates(system: ClosedLoop) -> tuple[Float[np.ndarray, " c"], Float
 
 def _climb(
     system: ClosedLoop,
-    peaks: Float[np.ndarray, " c"],
-    at: Float[np.ndarray, " c"],
+    peaks: PerCurve,
+    at: PerCurve,
     curve: Indices,
-    low: Float[np.ndarray, " m"],
-    high: Float[np.ndarray, " m"],
+    low: Angles,
+    high: Angles,
     wanted: Bool[np.ndarray, " m"] | None = None,
-) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+) -> tuple[PerCurve, PerCurve]:
     """Return the peaks with the local maxima from `low` to `high` taken in; unwanted ones only beside wanted ones."""
     if not curve.size:
         return peaks, at
 
-    def slope(theta: Float[np.ndarray, " m"], which: Indices) -> Float[np.ndarray, " m"]:
+    def slope(theta: Angles, which: Indices) -> Angles:
         return system.differentiate(theta, curve[which])[1]
 
     every = np.arange(curve.size)
@@ -215,12 +216,8 @@ def _climb(
 
 
 def _prove(
-    system: ClosedLoop,
-    peaks: Float[np.ndarray, " c"],
-    at: Float[np.ndarray, " c"],
-    curves: Int[np.ndarray, " k"],
-    edges: list[Float[np.ndarray, " _"]],
-) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    system: ClosedLoop, peaks: PerCurve, at: PerCurve, curves: Int[np.ndarray, " k"], edges: list[Edges]
+) -> tuple[PerCurve, PerCurve]:
     """Return the peaks, raised until no arc of the level just above holds more. Raises ControlError: without end."""
     for _ in range(MAX_PROOF_ROUNDS):
         curve = np.repeat(curves, [row.size - 1 for row in edges])

@@ -13,6 +13,7 @@ from seaopt.control.loops.sampled_plant import (
     read_conditions,
     sample_linear,
 )
+from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -21,8 +22,6 @@ from seaopt.plants.plant import share_drive
 from seaopt.records import record
 from seaopt.units import LINEAR
 
-Frequencies = Float[np.ndarray, " m"]
-Response = Complex[np.ndarray, " m"]
 BESIDE = 1e-7  # of a pole: nearer, the response is evaluated this far beside it
 NOT_AFFINE = 1e-6  # Delta of this share of its terms, and more, makes the condition quadratic in the gains
 

@@ -51,9 +51,11 @@ MAX_ZERO_STEPS = 100
 ROUNDINGS = 100 * float(np.finfo(float).eps)  # error of a sampled plant or a law, as a fraction
 LARGEST_ENTRY = 1e100  # entry of a loop's matrices: beyond, its eigenvalues cannot be computed
 
+Angles = Float[np.ndarray, " m"]  # rad a sample, or a number at each
+Edges = Float[np.ndarray, " _"]  # angles, as many as there are
 Pencil = tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k k"]]
 Indices = Int[np.ndarray, " m"]
-Indexed = Callable[[Float[np.ndarray, " m"], Indices], Float[np.ndarray, " m"]]
+Indexed = Callable[[Angles, Indices], Angles]
 
 
 @record(eq=False)
@@ -105,11 +107,11 @@ class ClosedLoop:
         """The eigenvalues of `a`."""
         return self.resolvent.poles
 
-    def curves(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
+    def curves(self, theta: Angles) -> Complex[np.ndarray, "k m"]:
         """Return S, T, S - T, C_y S, F/F_ref and what else is in the table at angles (rad) on the unit circle."""
         return self._combine(self.resolvent.respond(np.exp(1j * theta)))
 
-    def sensitivity(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def sensitivity(self, theta: Angles) -> Complex[np.ndarray, " m"]:
         """Return S as a product over its zeros and poles: exact where it vanishes, at an integrator."""
         z = np.exp(1j * theta)[:, None]
         return self.d[0, 0] * np.prod((z - self.opened) / (z - self.poles), axis=1)
@@ -123,7 +125,7 @@ class ClosedLoop:
         return np.concatenate([plant, np.zeros(self.opened.size - plant.size - law.size), law])
 
     def differentiate(
-        self, theta: Float[np.ndarray, " m"], which: Indices | None = None
+        self, theta: Angles, which: Indices | None = None
     ) -> tuple[Complex[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
         """Return the curves and half the derivatives of -1/abs(curve)^2 along the angle. These have the sign of the
         curve's own slope, and about a resonance they are close to a straight line. Of all curves, shape (k, m), or of
@@ -234,7 +236,7 @@ def _resolution(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
     return errors[order]
 
 
-def find_arcs(pencils: Sequence[Pencil]) -> list[Float[np.ndarray, " _"]]:
+def find_arcs(pencils: Sequence[Pencil]) -> list[Edges]:
     """Return, for each pencil, the angles from 0 to pi that separate where its function is positive and negative."""
     whole = _on_circle(np.stack([p[0] for p in pencils]), np.stack([p[1] for p in pencils]))
     rows = [_on_circle(m[None], k[None]) for m, k in pencils] if whole is None else list(whole[:, None])
@@ -254,7 +256,7 @@ def _on_circle(m: Float[np.ndarray, "p k k"], k: Float[np.ndarray, "p k k"]) -> 
     return None
 
 
-def find_sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]]) -> list[Float[np.ndarray, " _"]]:
+def find_sign_changes(function: Indexed, edges: Sequence[Edges]) -> list[Edges]:
     """Return where function(theta, which), of each set of arcs, changes sign; rounding about zero has none."""
     middles = [0.5 * (row[:-1] + row[1:]) for row in edges]
     which = np.repeat(np.arange(len(middles)), [row.size for row in middles])
@@ -282,13 +284,13 @@ def find_sign_changes(function: Indexed, edges: Sequence[Float[np.ndarray, " _"]
 
 def find_zeros(
     function: Indexed,
-    low: Float[np.ndarray, " m"],
-    high: Float[np.ndarray, " m"],
-    at_low: Float[np.ndarray, " m"],
-    at_high: Float[np.ndarray, " m"],
+    low: Angles,
+    high: Angles,
+    at_low: Angles,
+    at_high: Angles,
     tolerance: float,
     wanted: Bool[np.ndarray, " m"] | None = None,
-) -> Float[np.ndarray, " m"]:
+) -> Angles:
     """Return a zero in every bracket (Chandrupatla, Advances in Engineering Software 28, 1997). `function(x, i)` is
     evaluated at x for the brackets number i only. A bracket is done when it, or the function in it, is smaller than
     `tolerance` as a fraction of where it is, or of what it was; and all are when those `wanted` are.
@@ -313,15 +315,7 @@ def find_zeros(
     return b
 
 
-def _fraction(
-    a: Float[np.ndarray, " m"],
-    b: Float[np.ndarray, " m"],
-    c: Float[np.ndarray, " m"],
-    fa: Float[np.ndarray, " m"],
-    fb: Float[np.ndarray, " m"],
-    fc: Float[np.ndarray, " m"],
-    tolerance: float,
-) -> Float[np.ndarray, " m"]:
+def _fraction(a: Angles, b: Angles, c: Angles, fa: Angles, fb: Angles, fc: Angles, tolerance: float) -> Angles:
     """Return where to look next from b to a: by inverse quadratic interpolation where that is safe, else the middle."""
     with np.errstate(divide="ignore", invalid="ignore"):
         xi, phi = (b - a) / (c - a), (fb - fa) / (fc - fa)

@@ -36,8 +36,12 @@ from seaopt.plants.plant import DRIVE_DELAY, dynamics_function, refuse_samples
 from seaopt.records import record
 from seaopt.units import factor
 
+PerPlant = Float[np.ndarray, " k"]
+ValueColumns = Float[np.ndarray, "np k"]  # a column for each plant
+Matrices = Inexact[np.ndarray, "k n n"]
+Vectors = Inexact[np.ndarray, "k n"]
 LinearPlants = tuple[  # a, b, c, d from one input; c and d have a row for each output
-    Inexact[np.ndarray, "k n n"], Inexact[np.ndarray, "k n"], Inexact[np.ndarray, "k y n"], Inexact[np.ndarray, "k y"]
+    Matrices, Vectors, Inexact[np.ndarray, "k y n"], Inexact[np.ndarray, "k y"]
 ]
 SampledPlants = tuple[  # with more states, of commands on their way
     Inexact[np.ndarray, "k m m"], Inexact[np.ndarray, "k m"], Inexact[np.ndarray, "k y m"], Inexact[np.ndarray, "k y"]
@@ -125,7 +129,7 @@ def sample(
 
 def linearise_sets(
     plant: Plant, sets: Sequence[CompletedParameters], measured: Measured, gain: float
-) -> tuple[LinearPlants, Float[np.ndarray, " k"]]:
+) -> tuple[LinearPlants, PerPlant]:
     """Return what `linearise` does at k sets of parameters with the same conditions among them, and their delays (s).
     Raises ControlError: the plant has no such output, or cannot rest where it is to be linearised.
     """
@@ -136,7 +140,7 @@ def linearise_sets(
 
 
 def sample_linear(
-    plants: LinearPlants, delay_s: Float[np.ndarray, " k"], sample_time_s: float, delay_samples: int
+    plants: LinearPlants, delay_s: PerPlant, sample_time_s: float, delay_samples: int
 ) -> list[DigitalPlant]:
     """Return the digital plants of k linear ones and their delays, seconds besides the whole samples."""
     return [
@@ -222,11 +226,7 @@ def read_conditions(plant: Plant, params: ParameterSet) -> dict[str, float]:
 
 
 def linearise(
-    plant: Plant,
-    p: Float[np.ndarray, "np k"],
-    at: Mapping[str, Float[np.ndarray, " k"]],
-    measured: Measured,
-    gain: float,
+    plant: Plant, p: ValueColumns, at: Mapping[str, PerPlant], measured: Measured, gain: float
 ) -> LinearPlants:
     """Return (a, b, c, d) from motor force to what is measured of k plants, one column of parameters each. Raises
     ControlError: the plant has no such output, or cannot rest where it is to be linearised. Raises PlantError: the
@@ -281,7 +281,7 @@ def find_rest(plant: Plant, params: CompletedParameters) -> tuple[Float[np.ndarr
 
 
 def find_rests(
-    plant: Plant, params: CompletedParameters, places: Mapping[str, Float[np.ndarray, " k"]], count: int
+    plant: Plant, params: CompletedParameters, places: Mapping[str, PerPlant], count: int
 ) -> tuple[Float[np.ndarray, "nx k"], Float[np.ndarray, "nu k"]]:
     """Return what `find_rest` does at `count` places, a column each: of a coordinate by name, before the conditions."""
     fixed_conditions = {name: value for name, value in read_conditions(plant, params).items() if name not in DELAYS}
@@ -298,7 +298,7 @@ def _let_slide(plant: Plant) -> Plant:
 
 
 def _solve_rest(
-    plant: Plant, p: Float[np.ndarray, "np k"], at: Mapping[str, Float[np.ndarray, " k"]]
+    plant: Plant, p: ValueColumns, at: Mapping[str, PerPlant]
 ) -> tuple[Float[np.ndarray, "nx k"], Float[np.ndarray, "nu k"]]:
     """Return states and inputs at rest, by Newton's method in the first input and the states that are not given."""
     count, names = p.shape[1], list(plant.states)
@@ -332,10 +332,10 @@ def _solve_rest(
 
 def differentiate_linearisation(
     plant: Plant,
-    p: Float[np.ndarray, "np k"],
-    at: Mapping[str, Float[np.ndarray, " k"]],
-    dp: Float[np.ndarray, "np k"],
-    dat: Mapping[str, Float[np.ndarray, " k"]],
+    p: ValueColumns,
+    at: Mapping[str, PerPlant],
+    dp: ValueColumns,
+    dat: Mapping[str, PerPlant],
     measured: Measured,
     gain: float,
 ) -> tuple[LinearPlants, LinearPlants]:
@@ -361,7 +361,7 @@ def differentiate_linearisation(
 
 
 def _evaluate_jacobians(
-    plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: Float[np.ndarray, "np k"]
+    plant: Plant, x: Float[np.ndarray, "nx k"], u: Float[np.ndarray, "nu k"], p: ValueColumns
 ) -> tuple[Float[np.ndarray, "k _ _"], ...]:
     """Return A, B, C and D of k plants at rest, where bristles stick."""
     return _stack_blocks(plant, _map_columns(plant, rest_jacobians, x, u, p))
@@ -418,8 +418,8 @@ def _turn_function(plant: Plant) -> Any:
 
 
 def hold(
-    a: Inexact[np.ndarray, "k n n"],
-    b: Inexact[np.ndarray, "k n"],
+    a: Matrices,
+    b: Vectors,
     c: Inexact[np.ndarray, "k y n"],
     d: Inexact[np.ndarray, "k y"],
     sample_time_s: float,
@@ -454,9 +454,7 @@ def hold(
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a plant far off may overflow: the loop is then not stable
-def _exponential(
-    a: Inexact[np.ndarray, "k n n"], b: Inexact[np.ndarray, "k n"], t: Inexact[np.ndarray, " k"]
-) -> tuple[Inexact[np.ndarray, "k n n"], Inexact[np.ndarray, "k n"]]:
+def _exponential(a: Matrices, b: Vectors, t: Inexact[np.ndarray, " k"]) -> tuple[Matrices, Vectors]:
     """Return exp(a t) and the integral of exp(a s) b from 0 to t: Taylor's polynomial, scaled and squared."""
     # scipy.linalg.expm keeps complex steps too, but takes stacks one matrix at a time: 27 times as long at 1375 draws.
     n = a.shape[1]

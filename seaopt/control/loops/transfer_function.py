@@ -10,6 +10,8 @@ from jaxtyping import Complex, Float
 from seaopt.codec import Constraints
 from seaopt.records import record
 
+Frequencies = Float[np.ndarray, " m"]  # Hz
+Response = Complex[np.ndarray, " m"]  # at these
 POLE_ROUNDING = 1e-17  # least denominator, over the sum of its coefficients
 
 
@@ -20,7 +22,7 @@ class TransferFunction:
     num: Annotated[Float[np.ndarray, " n"], Constraints(min_length=1)]
     den: Annotated[Float[np.ndarray, " m"], Constraints(min_length=1)]
 
-    def response(self, f: Float[np.ndarray, " k"], sample_time_s: float) -> Complex[np.ndarray, " k"]:
+    def response(self, f: Frequencies, sample_time_s: float) -> Response:
         """Return the values at frequencies in Hz; next to a pole on the circle, no more than rounding allows."""
         q = np.exp(-2j * np.pi * f * sample_time_s)
         below = np.polynomial.polynomial.polyval(q, self.den)

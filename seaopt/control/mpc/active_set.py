@@ -31,6 +31,8 @@ from jaxtyping import Float, Int
 
 from seaopt.records import record
 
+Vector = Float[np.ndarray, " n"]
+PerRow = Float[np.ndarray, " m"]
 TOLERANCE, TOLERANCE_SINGLE = 1e-10, 1e-5  # by how much a bound may be broken, per 1 + the largest value of a row
 DEPENDENT, DEPENDENT_SINGLE = 1e-12, 1e-6  # square of what is left of a row besides the held ones: it depends on them
 SOLVED, UNFINISHED, INFEASIBLE = "solved", "maximum iterations reached", "the bounds contradict each other"
@@ -41,7 +43,7 @@ Ending = Literal["solved", "maximum iterations reached", "the bounds contradict 
 class QPSolution:
     """A point, where its rows are held, how the search ended, and the rows taken in or let go after the start."""
 
-    x: Float[np.ndarray, " n"]
+    x: Vector
     sides: Int[np.ndarray, " m"]  # 1: held at the high end, -1: at the low one, 0: not held; the next start
     status: Ending
     iterations: int
@@ -52,7 +54,7 @@ class _Held:
     """The nearest point on held rows, its multipliers, and Q with the upper triangle R of the rows' normals."""
 
     sides: dict[int, int]  # by row
-    point: Float[np.ndarray, " n"]
+    point: Vector
     dual: Float[np.ndarray, " k"]
     Q: Float[np.ndarray, "n n"]
     R: Float[np.ndarray, "k k"]
@@ -60,10 +62,10 @@ class _Held:
 
 @record(eq=False)
 class _Bounds:
-    start: Float[np.ndarray, " n"]
+    start: Vector
     normals: Float[np.ndarray, "m n"]
-    low: Float[np.ndarray, " m"]
-    high: Float[np.ndarray, " m"]
+    low: PerRow
+    high: PerRow
 
     def hold(self, sides: dict[int, int]) -> _Held:
         """Return the point nearest to the start on which each row has its end: the high one where its side is 1."""
@@ -110,10 +112,10 @@ class _Bounds:
 
 
 def find_nearest(
-    start: Float[np.ndarray, " n"],
+    start: Vector,
     normals: Float[np.ndarray, "m n"],
-    low: Float[np.ndarray, " m"],
-    high: Float[np.ndarray, " m"],
+    low: PerRow,
+    high: PerRow,
     sides: Int[np.ndarray, " m"],
     max_iterations: int,
 ) -> QPSolution:

@@ -40,6 +40,11 @@ from seaopt.records import record
 from seaopt.simulation.discretisation import expm_with_derivatives
 from seaopt.simulation.simulate import input_samples
 
+State = Float[np.ndarray, " n"]
+Matrix = Float[np.ndarray, "n n"]
+Outputs = Float[np.ndarray, " ny"]
+Inputs = Float[np.ndarray, " nu"]
+InputRows = Float[np.ndarray, "m nu"]
 WHITENESS_LAGS = 20
 RATE_TOLERANCE = 1e-6  # of the log's period against the estimator's
 
@@ -62,11 +67,11 @@ class EstimatorState:
         Measured less predicted, in the outputs' units; NaN where nothing was measured.
     """
 
-    predicted: Float[np.ndarray, " n"]
-    corrected: Float[np.ndarray, " n"]
-    applied: Float[np.ndarray, " nu"]
+    predicted: State
+    corrected: State
+    applied: Inputs
     past: Float[np.ndarray, "delay nu"]
-    innovation: Float[np.ndarray, " ny"]
+    innovation: Outputs
 
 
 @record(eq=False)
@@ -139,15 +144,15 @@ class Estimator:
     sample_time_s: float
     delay_samples: int
     noise: NoiseModel
-    A: Float[np.ndarray, "n n"]
+    A: Matrix
     B: Float[np.ndarray, "n nu"]
     C: Float[np.ndarray, "ny n"]
     D: Float[np.ndarray, "ny nu"]
     late: Float[np.ndarray, "n nu"]
     gain: Float[np.ndarray, "n ny"]
-    covariance: Float[np.ndarray, "n n"]
+    covariance: Matrix
     innovation_covariance: Float[np.ndarray, "ny ny"]
-    offset: Float[np.ndarray, " ny"]
+    offset: Outputs
     names: tuple[str, ...]
     units: tuple[str, ...]
     G: Float[np.ndarray, "nz n"]
@@ -171,29 +176,25 @@ class Estimator:
             innovation=np.full(len(self.outputs), np.nan),
         )
 
-    def list_acting(self, past: Float[np.ndarray, "m nu"]) -> Float[np.ndarray, " nu"]:
+    def list_acting(self, past: InputRows) -> Inputs:
         """Return the input in force as a sample is read, of those before it and its own."""
         return past[0 if np.any(self.late) else 1]
 
-    def advance(self, z: Float[np.ndarray, " n"], older: Any, newer: Any) -> Float[np.ndarray, " n"]:
+    def advance(self, z: State, older: Any, newer: Any) -> State:
         """Return z a sample later, in which one input stops acting and the next one begins to."""
         return self.A @ z + self.B @ newer + self.late @ older
 
-    def correct(
-        self, state: EstimatorState, y: Float[np.ndarray, " ny"], applied: Float[np.ndarray, " nu"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " ny"]]:
+    def correct(self, state: EstimatorState, y: Outputs, applied: Inputs) -> tuple[State, Outputs]:
         """Return z with this sample's measurement, and the innovation; one that is not finite corrects nothing."""
         innovation = y - self.offset - self.C @ state.predicted - self.D @ applied
         return state.predicted + self.gain @ np.where(np.isfinite(innovation), innovation, 0.0), innovation
 
-    def step(self, state: EstimatorState, u: Float[np.ndarray, " nu"], y: Float[np.ndarray, " ny"]) -> EstimatorState:
+    def step(self, state: EstimatorState, u: Inputs, y: Outputs) -> EstimatorState:
         """Process one sample: the inputs u commanded at it, and the outputs y measured at it (NaN: not measured)."""
         line = np.vstack([state.past, u])
         return self.go_on(line, *self.correct(state, y, self.list_acting(line)))
 
-    def go_on(
-        self, line: Float[np.ndarray, "m nu"], corrected: Float[np.ndarray, " n"], innovation: Float[np.ndarray, " ny"]
-    ) -> EstimatorState:
+    def go_on(self, line: InputRows, corrected: State, innovation: Outputs) -> EstimatorState:
         """Return the state after a sample: the inputs before it and its own, and what `correct` gave."""
         return EstimatorState(
             predicted=self.advance(corrected, line[0], line[1]),
@@ -240,7 +241,7 @@ class Estimator:
         radius = float(np.max(np.abs(np.linalg.eigvals(self.A @ (np.eye(len(self.A)) - self.gain @ self.C)))))
         return int(np.ceil(np.log(1e-3) / np.log(min(max(radius, 1e-3), 1.0 - 1e-12))))
 
-    def _samples(self, log: Log) -> tuple[Float[np.ndarray, "m nu"], Float[np.ndarray, "m ny"]]:
+    def _samples(self, log: Log) -> tuple[InputRows, Float[np.ndarray, "m ny"]]:
         if abs(log.period / self.sample_time_s - 1.0) > RATE_TOLERANCE:
             raise ControlError(
                 f"{log.source} is sampled every {log.period:.6g} s, the estimator every {self.sample_time_s:.6g} s; "
@@ -396,11 +397,11 @@ def _check(
 def _solve_riccati(
     plant: Plant,
     outputs: tuple[str, ...],
-    A: Float[np.ndarray, "n n"],
+    A: Matrix,
     C: Float[np.ndarray, "ny n"],
-    Q: Float[np.ndarray, "n n"],
+    Q: Matrix,
     R: Float[np.ndarray, "ny ny"],
-) -> Float[np.ndarray, "n n"]:
+) -> Matrix:
     """Return the covariance of the prediction in steady state."""
     from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
 
@@ -422,7 +423,7 @@ def _solve_riccati(
         ) from error
 
 
-def run_recursion(a: Float[np.ndarray, "n n"], v: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+def run_recursion(a: Matrix, v: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
     """Return x with x[k] = a x[k-1] + v[k], x[-1] = 0, by doubling the reach until a's power has died out."""
     x, power, reach = v, a, 1
     while reach < len(v) and np.max(np.abs(power)) > 1e-18:

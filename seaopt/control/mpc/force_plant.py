@@ -9,22 +9,24 @@ from jaxtyping import Float
 
 from seaopt.records import record
 
+State = Float[np.ndarray, " nx"]
+
 
 @record(eq=False)
 class ForcePlant:
     """The plant x+ = A x + b u + b' u-, u- the command before, whose measured force is c x."""
 
     a: Float[np.ndarray, "nx nx"]
-    b: Float[np.ndarray, " nx"]
-    late: Float[np.ndarray, " nx"]  # b', where the drive's delay leaves a part of a sample
-    c: Float[np.ndarray, " nx"]
-    w: Float[np.ndarray, " nx"]  # the row whose square the cost weighs: force and lag times its rate
+    b: State
+    late: State  # b', where the drive's delay leaves a part of a sample
+    c: State
+    w: State  # the row whose square the cost weighs: force and lag times its rate
     lag_s: float
     gain: float  # N/A at rest
     sample_time_s: float
 
     @property
-    def rest(self) -> Float[np.ndarray, " nx"]:
+    def rest(self) -> State:
         """The state at rest per unit of command."""
         return np.linalg.solve(np.eye(self.b.size) - self.a, self.b + self.late)
 

@@ -73,6 +73,9 @@ from seaopt.plants.plant import find_range, name_input, require_plant
 from seaopt.records import Result, Worded, record
 from seaopt.units import mechanics_of, name_command, show_command, unit_after
 
+References = Float[np.ndarray, " r"]
+State = Float[np.ndarray, " n"]  # z of the filter
+PerRow = Float[np.ndarray, " m"]  # of the program
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 LOWEST_SHARE = 7.0  # of the bandwidth asked: down to a seventh of it one that is possible is looked for
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
@@ -275,7 +278,7 @@ class ForceMPC(LoopDelays, Result, Worded):
             shaped=() if self.spec.low_pass is None else (0.0,) * (self.spec.low_pass.den.size - 1),
         )
 
-    def step(self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float) -> MPCStep:
+    def step(self, state: MPCState, reference_N: float | References, measurement_N: float) -> MPCStep:
         """Return the current for a reference and a measured force; one that is not finite is predicted.
 
         Parameters
@@ -344,9 +347,7 @@ class ForceMPC(LoopDelays, Result, Worded):
             step_time_s=time.perf_counter() - began,
         )
 
-    def command(
-        self, state: MPCState, reference_N: float | Float[np.ndarray, " r"], measurement_N: float
-    ) -> tuple[float, MPCState]:
+    def command(self, state: MPCState, reference_N: float | References, measurement_N: float) -> tuple[float, MPCState]:
         """Return the current and the next state alone, as `close_loop` takes them."""
         result = self.step(state, reference_N, measurement_N)
         return result.current_A, result.state
@@ -357,14 +358,8 @@ class ForceMPC(LoopDelays, Result, Worded):
         return float(np.clip(np.clip(current_A, last_A - slew, last_A + slew), -most_A, most_A))
 
     def program(
-        self,
-        xi: Float[np.ndarray, " nx"],
-        u_s: float,
-        last_A: float,
-        drift: float,
-        targets: Float[np.ndarray, " r"],
-        most_A: float,
-    ) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        self, xi: Float[np.ndarray, " nx"], u_s: float, last_A: float, drift: float, targets: References, most_A: float
+    ) -> tuple[Float[np.ndarray, " nv"], PerRow, PerRow]:
         """Return the vectors of the quadratic program: its gradient, lower and upper bounds of its rows.
 
         `xi`: the state's distance from its target. `u_s`, `last_A`, `drift`: the command at rest, the last one, and the
@@ -384,7 +379,7 @@ class ForceMPC(LoopDelays, Result, Worded):
         high = np.concatenate([(most_A / limit - u_s / limit) * ones, slopes + 1.0, over])
         return q, low, high
 
-    def _read_references(self, references_N: float | Float[np.ndarray, " r"]) -> Float[np.ndarray, " p"]:
+    def _read_references(self, references_N: float | References) -> Float[np.ndarray, " p"]:
         """Return the references of this sample and of all that may be known, the last held."""
         references, count = np.atleast_1d(np.asarray(references_N, dtype=float)), 1 + self.spec.preview_samples
         if not (references.ndim == 1 and 1 <= references.size <= count):
@@ -396,9 +391,7 @@ class ForceMPC(LoopDelays, Result, Worded):
             raise ControlError(f"reference_N = {references_N}: not a force; hold the last one instead")
         return np.concatenate([references, np.full(count - references.size, references[-1])])
 
-    def _observe(
-        self, kalman: EstimatorState, measurement: float
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " 1"], Float[np.ndarray, " n"]]:
+    def _observe(self, kalman: EstimatorState, measurement: float) -> tuple[State, Float[np.ndarray, " 1"], State]:
         """Return z with the measurement, the innovation, and z when a current commanded now arrives."""
         line = kalman.past  # D = 0: which of them acts does not matter to the innovation
         corrected, innovation = self.kalman.correct(kalman, np.array([measurement]), line[0])
@@ -407,16 +400,14 @@ class ForceMPC(LoopDelays, Result, Worded):
             ahead = self.kalman.advance(ahead, older, newer)
         return corrected, innovation, ahead
 
-    def _targets(
-        self, drift: float, references: Float[np.ndarray, " p"], most_A: float
-    ) -> tuple[float, Float[np.ndarray, " r"]]:
+    def _targets(self, drift: float, references: Float[np.ndarray, " p"], most_A: float) -> tuple[float, References]:
         """Return the current at rest for the last reference, and the nearest forces to all that the limits can hold."""
         ends = self.prediction.outputs.admissible_rest(drift, most_A)
         currents = np.clip(references / self.static_gain - drift, *ends)
         first = min(self.kalman.delay_samples, references.size - 1)
         return float(currents[-1]), self.static_gain * (currents[first:] + drift)
 
-    def _fault(self, solution: QPSolution, low: Float[np.ndarray, " m"], high: Float[np.ndarray, " m"]) -> str:
+    def _fault(self, solution: QPSolution, low: PerRow, high: PerRow) -> str:
         """Return why a solution is not used; an unfinished one is if it keeps the limits."""
         if solution.status not in (SOLVED, UNFINISHED):
             return solution.status
@@ -428,11 +419,7 @@ class ForceMPC(LoopDelays, Result, Worded):
         return f"{UNFINISHED}, {broken}" if broken and solution.status == UNFINISHED else broken
 
     def _command(
-        self,
-        kalman: EstimatorState,
-        corrected: Float[np.ndarray, " n"],
-        innovation: Float[np.ndarray, " 1"],
-        current: float,
+        self, kalman: EstimatorState, corrected: State, innovation: Float[np.ndarray, " 1"], current: float
     ) -> EstimatorState:
         """Return the filter's state after a sample at which a current was commanded."""
         line = np.vstack([kalman.past, np.zeros(self.kalman.B.shape[1])])

@@ -58,6 +58,7 @@ from seaopt.control.scheduling.step_order import INVERSE_GAIN, StepOrder
 from seaopt.errors import ControlError
 from seaopt.records import record
 
+PerPoint = Float[np.ndarray, " n"]
 STRUCTURES = ("pd", "pid", "pid_dob", CASCADE)  # whose gains can be interpolated
 CORNERS = {NOTCH_GAINS[0]: "notch_w", PREFILTER: "prefilter_w"}  # tan(pi f T_s) of a frequency in Hz
 LINK_NUMBERS = ("inertia", "damping")
@@ -107,8 +108,8 @@ class GainTable:
 
     over: str
     unit: str
-    points: Float[np.ndarray, " n"]
-    gains: Mapping[str, Float[np.ndarray, " n"]]
+    points: PerPoint
+    gains: Mapping[str, PerPoint]
     structure: Structure
     sample_time_s: float
     speed: SpeedLoop | None = None
@@ -165,7 +166,7 @@ class GainTable:
         return _list_states(self)
 
     @property
-    def columns(self) -> Mapping[str, Float[np.ndarray, " n"]]:
+    def columns(self) -> Mapping[str, PerPoint]:
         """The rows of numbers that are interpolated, by the names that `StepOrder` has for them."""
         return _list_columns(self)
 
@@ -189,7 +190,7 @@ class GainTable:
             for name in self.gains
         }
 
-    def find_numbers(self, value: float, **more: Float[np.ndarray, " n"]) -> dict[str, float]:
+    def find_numbers(self, value: float, **more: PerPoint) -> dict[str, float]:
         """Return the numbers of `columns` at a finite value, and of `more` rows at the points."""
         i, t = self.find_stretch(value)
         return {name: float(row[i] + t * (row[i + 1] - row[i])) for name, row in {**self.columns, **more}.items()}
@@ -269,7 +270,7 @@ def _list_states(table: GainTable) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=16)
-def _list_columns(table: GainTable) -> Mapping[str, Float[np.ndarray, " n"]]:
+def _list_columns(table: GainTable) -> Mapping[str, PerPoint]:
     """Return the rows of a table with its corners warped, once."""
     columns = {
         CORNERS.get(name, name): np.tan(np.pi * row * table.sample_time_s) if name in CORNERS else np.asarray(row)
@@ -292,7 +293,7 @@ def refuse_structure(structure: str) -> ControlError:
     return ControlError(f'structure = "{structure}" cannot be scheduled; use one of {names}')
 
 
-def check_points(over: str, points: Float[np.ndarray, " n"]) -> None:
+def check_points(over: str, points: PerPoint) -> None:
     """Refuse points that no table can have (ControlError): fewer than two or too many, or not ascending."""
     values = np.asarray(points)
     if values.ndim != 1 or not 2 <= values.size <= MOST_POINTS:

@@ -13,12 +13,11 @@ from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.loops.measured.loop import bound_disc
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.records import record
 
-Frequencies = Float[np.ndarray, " m"]
 Curve = Float[np.ndarray, " m"]  # over frequency
 Usage = Float[np.ndarray, "k m"]  # of a limit, a row for each plant
-Response = Complex[np.ndarray, " m"]
 Responses = Complex[np.ndarray, "n m"]
 ComplexArray = Complex[np.ndarray, "..."]
 Values = Float[np.ndarray, " n"]

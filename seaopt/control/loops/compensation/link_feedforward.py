@@ -48,13 +48,13 @@ from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Complex
 
 from seaopt.codec import Constraints
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import linearise_sets
-from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
 from seaopt.errors import ControlError
 from seaopt.options import option
 from seaopt.parameters import ParameterSet
@@ -254,7 +254,7 @@ def _relate(plant: Plant, params: ParameterSet, name: str, per_effort: float) ->
     return float(motion[link_states[0]] / (position or speed)), bool(position == 0.0)
 
 
-def _fit(effort: Complex[np.ndarray, " m"], f: Float[np.ndarray, " m"], name: str) -> tuple[float, float]:
+def _fit(effort: Response, f: Frequencies, name: str) -> tuple[float, float]:
     """Return inertia and damping of an effort per speed, by least squares."""
     s = 2j * np.pi * f
     terms = np.column_stack([s, np.ones_like(s)]) / np.abs(effort)[:, None]
@@ -275,7 +275,7 @@ def limit_fraction(
     path: LinkPath,
     motions: Complex[np.ndarray, "n m"],
     beyond: Bool[np.ndarray, "n m"],
-    f: Float[np.ndarray, " m"],
+    f: Frequencies,
     sample_time_s: float,
     max_sensitivity: float,
 ) -> float:

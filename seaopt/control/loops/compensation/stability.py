@@ -61,6 +61,9 @@ from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.sampled_plant import sample_linear
 from seaopt.records import record
 
+AtAngles = Complex[np.ndarray, " m"]
+AtAliases = Complex[np.ndarray, "m k"]
+Forms = Complex[np.ndarray, "m 3 3"]
 SHARE = 0.9  # rho, below 1: the sum of what N weighs later or earlier samples with
 SIMPLEST_SHIFT = "1"
 SHIFTS = (SIMPLEST_SHIFT, "1 - rho/z", "1 - rho z", "1 + rho/z", "1 + rho z")
@@ -76,13 +79,13 @@ class SpeedReading:
     velocity: Float[np.ndarray, " n"]  # its row of the states
     differenced: bool  # it is the difference of two samples of a position, over the time between them
 
-    def weigh(self, theta: Angles, s: Complex[np.ndarray, "m k"], period: float) -> Complex[np.ndarray, "m k"]:
+    def weigh(self, theta: Angles, s: AtAliases, period: float) -> AtAliases:
         """Return what is read of a velocity at every alias."""
         if not self.differenced:
             return np.ones_like(s)
         return -np.expm1(-1j * theta)[:, None] / (period * s)
 
-    def respond(self, loop: FrictionLoop, theta: Angles) -> Complex[np.ndarray, " m"]:
+    def respond(self, loop: FrictionLoop, theta: Angles) -> AtAngles:
         """Return P_s at angles, the hold and the delay in it; its position is integrated with the plant."""
         n, period = len(loop.a), loop.plant.sample_time_s
         a, b = np.zeros((n + 1, n + 1)), np.append(loop.motor, 0.0)
@@ -158,8 +161,8 @@ class _Readings:
 
     friction: LoopResponses
     speed: Complex[np.ndarray, "m k p"]
-    through: Complex[np.ndarray, " m"]
-    sensitivity: Complex[np.ndarray, " m"]
+    through: AtAngles
+    sensitivity: AtAngles
 
     @classmethod
     def at(cls, loop: FrictionLoop, reading: SpeedReading, theta: Angles) -> _Readings:
@@ -179,8 +182,8 @@ class _MultiplierTest:
     """The test for one multiplier of the friction: factors of Gamma, and of what it is tested with."""
 
     at: _Readings
-    left: Complex[np.ndarray, "m 3 3"]
-    inner: Complex[np.ndarray, "m 3 3"]
+    left: Forms
+    inner: Forms
 
     @classmethod
     def of(cls, at: _Readings, multiplier: Multiplier) -> _MultiplierTest | None:
@@ -272,7 +275,7 @@ class _LeastInverse:
         return float(self.theta[np.argmax(self.at_ratio(self.ratio))])
 
 
-def _shift(name: str, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+def _shift(name: str, z: AtAngles) -> AtAngles:
     """Return N of a name."""
     if name == SIMPLEST_SHIFT:
         return np.ones_like(z)
@@ -280,7 +283,7 @@ def _shift(name: str, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]
     return 1.0 + sign * SHARE * (1.0 / z if "/" in name else z)
 
 
-def _gather(at: _Readings, weight: Complex[np.ndarray, "m k"]) -> Complex[np.ndarray, "m 3 3"] | None:
+def _gather(at: _Readings, weight: AtAliases) -> Forms | None:
     """Return a factor L of Gamma = L L*, what is beyond the aliases added; None where some D is not positive."""
     friction = at.friction
     possible, inverse = invert_mobility(weight, friction.mobility, 1.0)

@@ -21,20 +21,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from seaopt.control.loops.crossings import find_crossings
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.loop import (
-    DROOP_BAND,
-    FALLEN_ABOVE,
-    GRID_LOWEST_HZ,
-    SHOULDER,
-    SHOULDER_FALL,
-    LoopFigures,
-)
+from seaopt.control.loops.loop import DROOP_BAND, FALLEN_ABOVE, GRID_LOWEST_HZ, SHOULDER, SHOULDER_FALL, LoopFigures
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.peaks import HALF_POWER
+from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.records import record
 
 POINTS_BETWEEN = 4  # of the grid between two measured frequencies
@@ -58,19 +52,19 @@ class DiscLoop:
     plant: MeasuredPlant
     law: Law
 
-    def open_loop(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def open_loop(self, f: Frequencies) -> Response:
         """Return L of the centres."""
         return self.plant.response(f) * self.law.measurement_response(f)
 
-    def sensitivity(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def sensitivity(self, f: Frequencies) -> Response:
         """Return S of the centres."""
         return 1.0 / (1.0 + self.open_loop(f))
 
-    def tracking(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def tracking(self, f: Frequencies) -> Response:
         """Return F/F_ref of the centres."""
         return self.plant.response(f) * self.law.reference_response(f) * self.sensitivity(f)
 
-    def grid(self) -> Float[np.ndarray, " m"]:
+    def grid(self) -> Frequencies:
         """Return frequencies up to the Nyquist frequency: the measured ones, some between, and the law's own."""
         at, nyquist = self.plant.f, self.plant.nyquist_hz
         steps = np.linspace(0.0, 1.0, POINTS_BETWEEN, endpoint=False)
@@ -149,9 +143,7 @@ class DiscLoop:
         least, most = (_first(f, HALF_POWER * static - size) for size in sizes)
         return least, most
 
-    def _find_return(
-        self, f: Float[np.ndarray, " m"], most: Float[np.ndarray, " m"], down: float, static: float
-    ) -> float | None:
+    def _find_return(self, f: Frequencies, most: Frequencies, down: float, static: float) -> float | None:
         """Return where the largest of the discs comes back above -3 dB, or lingers, above the bandwidth."""
         low, high = FALLEN_ABOVE * down, min(SHOULDER * down, self.plant.nyquist_hz)
         allowed = HALF_POWER * static * (down / f) ** SHOULDER_FALL
@@ -186,7 +178,7 @@ def bound_disc(
     return np.maximum(centre - radius, 0.0) / room, (centre + radius) / room
 
 
-def _first(f: Float[np.ndarray, " m"], over: Float[np.ndarray, " m"]) -> float | None:
+def _first(f: Frequencies, over: Frequencies) -> float | None:
     """Return the first frequency at which a curve is above zero, by a straight line; None where it never is."""
     above = np.flatnonzero(over > 0.0)
     if not above.size:
@@ -198,9 +190,7 @@ def _first(f: Float[np.ndarray, " m"], over: Float[np.ndarray, " m"]) -> float |
     return float(f[k - 1] + share * (f[k] - f[k - 1]))
 
 
-def _band(
-    f: Float[np.ndarray, " m"], least: Float[np.ndarray, " m"], most: Float[np.ndarray, " m"]
-) -> tuple[float, float] | None:
+def _band(f: Frequencies, least: Frequencies, most: Frequencies) -> tuple[float, float] | None:
     """Return the widest band in which every response in the discs stays within 3 dB of 1."""
     inside = (least > HALF_POWER) & (most < 1.0 / HALF_POWER)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(int), [0]]))).reshape(-1, 2)

@@ -22,6 +22,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.errors import ControlError
 from seaopt.frequency.measured import MeasuredResponse
 from seaopt.records import record
@@ -41,9 +42,9 @@ class MeasuredPlant:
     """Discs over frequency, from effort to what is measured, with hold and delay of the controller."""
 
     name: str  # of the experiment
-    f: Float[np.ndarray, " m"]  # the measured frequencies (Hz)
-    centre: Complex[np.ndarray, " m"]
-    radius: Float[np.ndarray, " m"]
+    f: Frequencies  # the measured frequencies (Hz)
+    centre: Response
+    radius: Frequencies
     sample_time_s: float  # seconds
     end: float  # abs(P) at the end of the band at most, without folding
     folded: float  # what folding adds to that above the band, at most
@@ -118,9 +119,7 @@ def sample_measured(
     )
 
 
-def _check_rest(
-    measured: MeasuredResponse, f: Float[np.ndarray, " m"], centre: Complex[np.ndarray, " m"], delay_s: float
-) -> None:
+def _check_rest(measured: MeasuredResponse, f: Frequencies, centre: Response, delay_s: float) -> None:
     """Refuse a response that is not that of rest and a delay at its lowest frequency."""
     turn = float(np.angle(centre[0] * np.exp(2j * np.pi * f[0] * delay_s)))
     turn = min(abs(turn), abs(np.pi - abs(turn)))  # a static gain may be negative
@@ -132,14 +131,14 @@ def _check_rest(
         )
 
 
-def hold_response(f: Float[np.ndarray, " m"], clock: Clock) -> Complex[np.ndarray, " m"]:
+def hold_response(f: Frequencies, clock: Clock) -> Response:
     """Return the response of the hold alone."""
     if clock.hold == "first":
         return np.sinc(f * clock.period) ** 2 + 0j
     return np.sinc(f * clock.period) * np.exp(-1j * np.pi * f * clock.period)
 
 
-def _fold(f: Float[np.ndarray, " m"], clock: Clock, end: float, end_hz: float) -> Float[np.ndarray, " m"]:
+def _fold(f: Frequencies, clock: Clock, end: float, end_hz: float) -> Frequencies:
     """Return at most what folding adds to sampled responses of a plant that falls as end end_hz/f above end_hz."""
     out = np.zeros(f.size)
     for k in (*range(-FOLDED, 0), *range(1, FOLDED + 1)):
