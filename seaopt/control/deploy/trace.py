@@ -6,40 +6,23 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+SIGNS = {np.add: "+", np.subtract: "-", np.multiply: "*", np.true_divide: "/"}
+
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class Term(NDArrayOperatorsMixin):
     """A number in the C code: its name, and the trace that it belongs to."""
 
     trace: Trace
     text: str
 
-    def __add__(self, other: Any) -> Term:
-        return self.trace.combine(self, "+", other)
-
-    def __radd__(self, other: Any) -> Term:
-        return self.trace.combine(other, "+", self)
-
-    def __sub__(self, other: Any) -> Term:
-        return self.trace.combine(self, "-", other)
-
-    def __rsub__(self, other: Any) -> Term:
-        return self.trace.combine(other, "-", self)
-
-    def __mul__(self, other: Any) -> Term:
-        return self.trace.combine(self, "*", other)
-
-    def __rmul__(self, other: Any) -> Term:
-        return self.trace.combine(other, "*", self)
-
-    def __truediv__(self, other: Any) -> Term:
-        return self.trace.combine(self, "/", other)
-
-    def __rtruediv__(self, other: Any) -> Term:
-        return self.trace.combine(other, "/", self)
-
-    def __neg__(self) -> Term:
-        return self.trace.keep(f"-{self.text}", [self.text])
+    def __array_ufunc__(self, ufunc: Any, _method: str, *sides: Any) -> Term:
+        if ufunc is np.negative:
+            return self.trace.keep(f"-{self.text}", [self.text])
+        return self.trace.combine(sides[0], SIGNS[ufunc], sides[1])
 
 
 @dataclass(slots=True)

@@ -58,8 +58,38 @@ _NOT_ACHIEVED = ("stable", "spectral_radius", "ms_hz")
 _UNKNOWN = LoopFigures(stable=False, spectral_radius=np.nan)
 
 
+class ClosesLoops(LoopDelays):
+    """What a law and a plan have in common: the loop around a plant, from what is read to the effort commanded."""
+
+    __slots__ = ()
+    law: Any
+    per_effort: Any
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The outputs that are read, the regulated one first."""
+        return list_names(self.spec.measured)
+
+    def see(self, plant: Plant) -> Plant:
+        """Return a plant with every signal that is read."""
+        return plant
+
+    def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
+        """Return a plant as this controller sees it: from effort, through its own command per effort."""
+        timing, gain = (self.sample_time_s, self.compute_delay_samples), self.per_effort
+        return sample(self.see(plant), self.delay(params), self.signals, gain, *timing)
+
+    def close(self, plant: Plant, params: ParameterSet) -> Loop:
+        """Return the loop of this controller around a plant, which slides where it has friction; of a plan while no
+        limit is active.
+
+        At rest smoothed friction looks like a damper that is gone in motion; `seaopt.plants.friction` has both plants.
+        """
+        return Loop(plant=self.plant(take_sliding(plant, params), params), law=self.law)
+
+
 @record(eq=False, repr=False)
-class Controller(LoopDelays, Result, Worded):
+class Controller(ClosesLoops, Result, Worded):
     """A law from reference and measured force to an effort, commanded as the input of the plant that makes that effort.
 
     Parameters
@@ -380,25 +410,6 @@ class Controller(LoopDelays, Result, Worded):
         """Return a plant with every signal that the law reads: a link that is held does not move."""
         return plant if self.link is None else self.link.see(plant)
 
-    def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
-        """Return a plant as this controller sees it: from effort, through its own command per effort."""
-        return sample(
-            self.see(plant),
-            self.delay(params),
-            self.signals,
-            self.command.per_effort,
-            self.sample_time_s,
-            self.compute_delay_samples,
-        )
-
-    def close(self, plant: Plant, params: ParameterSet) -> Loop:
-        """Return the loop of this controller around a plant, which slides where it has friction.
-
-        At rest smoothed friction looks like a damper that is gone in motion; `seaopt.plants.friction` has both plants.
-        """
-        sliding = self.plant(take_sliding(plant, params), params)
-        return Loop(plant=sliding, law=self.law)
-
     def to_control(self) -> control.StateSpace:
         """Return the law as python-control's `StateSpace`, from reference and measured to effort, in discrete time."""
         return self.law.to_control()
@@ -512,7 +523,7 @@ class Controller(LoopDelays, Result, Worded):
         return {" sliding" if stuck else "": self.achieved} | stuck
 
 
-def find_friction_margin(controller: Controller, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
+def find_friction_margin(controller: ClosesLoops, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
     """Return how much steeper friction may be with stability shown, between the samples too; None without friction. The
     linear plant is the sliding one; what a curve's slope is above its flattest is in the sector. The controller's
     measurement path closes the loop; the reference stands still; `params` may hold conditions. The factor is zero where
@@ -523,18 +534,17 @@ def find_friction_margin(controller: Controller, plant: Plant, params: Parameter
 
 
 def find_friction_margins(
-    controller: Controller, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
+    controller: ClosesLoops, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
 ) -> list[FrictionMargin | None]:
     """Return `find_friction_margin` at sets of parameters with the same conditions; see `friction_margin`."""
     loops = take_friction_out(controller, plant, sets)
     return [None if loop is None else friction_margin(loop, first, least) for loop in loops]
 
 
-def take_friction_out(controller: Controller, plant: Plant, sets: Sequence[ParameterSet]) -> list[FrictionLoop | None]:
+def take_friction_out(controller: ClosesLoops, plant: Plant, sets: Sequence[ParameterSet]) -> list[FrictionLoop | None]:
     """Return `make_friction_loops` of a controller."""
-    late, gain = [controller.delay(params) for params in sets], controller.command.per_effort
-    waits = controller.compute_delay_samples
-    return make_friction_loops(plant, late, controller.signals, gain, waits, controller.law)
+    late, waits = [controller.delay(params) for params in sets], controller.compute_delay_samples
+    return make_friction_loops(plant, late, controller.signals, controller.per_effort, waits, controller.law)
 
 
 def _list_achieved(figures: LoopFigures) -> dict[str, Any]:

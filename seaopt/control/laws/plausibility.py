@@ -425,7 +425,7 @@ class PlausibilityGate:
             largest = spec.margin * largest_step(plant, limit / controller.per_effort)
         agreement = None
         if spec.agreement:
-            if controller.design is None or not hasattr(controller, "signals"):
+            if controller.design is None or not hasattr(controller, "reads"):
                 raise ControlError("agreement: it is of a law that knows its design plant; leave it out")
             plant, values = controller.design
             rate = largest / controller.sample_time_s

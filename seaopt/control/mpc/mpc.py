@@ -32,17 +32,17 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import Command, command_of, limit_notes
-from seaopt.control.laws.delay import LoopDelays, settle_delays, warn_delays
+from seaopt.control.laws.controller import ClosesLoops, find_friction_margin
+from seaopt.control.laws.delay import settle_delays, warn_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.realisation import check_guards
 from seaopt.control.laws.verdict import LimitVerdict, explain_broken, judge_all, list_broken, shorten_blocked
-from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
-from seaopt.control.loops.friction_loop import make_friction_loops
+from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.loops.sampled_plant import DELAYS, DigitalPlant, find_delay, read_conditions, sample
+from seaopt.control.loops.sampled_plant import DELAYS, DigitalPlant, find_delay, find_rows, read_conditions, sample
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
 from seaopt.control.mpc.force_plant import ForcePlant
@@ -61,7 +61,7 @@ from seaopt.control.mpc.quadratic_program import (
 from seaopt.control.mpc.spec import MPCSpec
 from seaopt.control.mpc.step import MPCState, MPCStep, shape_references
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
-from seaopt.errors import ControlError, require_type, suggestion
+from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
@@ -82,7 +82,7 @@ SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then
 
 
 @record(eq=False, repr=False)
-class ForceMPC(LoopDelays, Result, Worded):
+class ForceMPC(ClosesLoops, Result, Worded):
     """A force controller within limits; `force_mpc` makes one.
 
     Parameters
@@ -169,10 +169,7 @@ class ForceMPC(LoopDelays, Result, Worded):
     @memo
     def friction(self) -> FrictionMargin | None:
         """How much steeper friction may be with stability shown while no limit is active; None without friction."""
-        plant, values = self.design
-        waits = self.compute_delay_samples
-        (loop,) = make_friction_loops(plant, [values], self.measured, self.per_effort, waits, self.law)
-        return None if loop is None else friction_margin(loop)
+        return find_friction_margin(self, *self.design)
 
     @property
     def measured(self) -> str:
@@ -260,8 +257,7 @@ class ForceMPC(LoopDelays, Result, Worded):
         chosen = self.spec.reference_filter
         if chosen is None:
             return ()
-        loop, plan, scale = self.close(*self.design), self.unlimited(), self.per_effort
-        bare = replace(loop, law=replace(plan, b=plan.b / scale, d=plan.d / scale)).figures().bandwidth_hz
+        bare = replace(self.close(*self.design), law=self._plan).figures().bandwidth_hz
         kind = chosen.order.replace("_", " ")
         return (f"prefilter of {kind} at {chosen.corner_hz:.4g} Hz; without it the bandwidth is {bare:.4g} Hz",)
 
@@ -455,27 +451,21 @@ class ForceMPC(LoopDelays, Result, Worded):
             sample_time_s=self.spec.sample_time_s,
         )
 
-    def close(self, plant: Plant, params: ParameterSet) -> Loop:
-        """Return the loop around a plant while no limit is active; its figures are in newtons of motor force.
-
-        A plant with friction slides, as in `Controller.close`.
-        """
-        sliding = take_sliding(plant, params)
-        timing = self.sample_time_s, self.compute_delay_samples
-        digital = sample(sliding, self.delay(params), self.measured, self.per_effort, *timing)
-        return Loop(plant=digital, law=self.law)
+    @property
+    def _plan(self) -> Law:
+        """The plan as long as no limit is active, to effort."""
+        return self.unlimited().scaled(1.0 / self.per_effort)
 
     @property
     def law(self) -> Law:
         """What it is while no limit is active, from reference and measurement to effort."""
-        law, scale = self.unlimited(), self.per_effort
-        a, b, c, d = law.a, law.b / scale, law.c, law.d / scale
-        if self.spec.low_pass is not None:
-            inner, into, seen, direct = self.spec.low_pass.state_space()
-            a = np.block([[a, np.outer(b[:, 0], seen)], [np.zeros((into.size, c.size)), inner]])
-            b = np.vstack([b * [direct, 1.0], np.column_stack([into, 0.0 * into])])
-            c, d = np.append(c, d[0] * seen), d * [direct, 1.0]
-        return replace(law, a=a, b=b, c=c, d=d)
+        plan, low_pass = self._plan, self.spec.low_pass
+        if low_pass is None:
+            return plan
+        inner, into, seen, direct = low_pass.state_space()
+        a = np.block([[plan.a, np.outer(plan.b[:, 0], seen)], [np.zeros((into.size, plan.c.size)), inner]])
+        b = np.vstack([plan.b * [direct, 1.0], np.column_stack([into, 0.0 * into])])
+        return replace(plan, a=a, b=b, c=np.append(plan.c, plan.d[0] * seen), d=plan.d * [direct, 1.0])
 
     def describe_limits(self) -> str:
         """Return the limits of the command and its rate, as text."""
@@ -530,10 +520,7 @@ def force_mpc(
     check_guards(gate, heat, name_input(plant))
     if gate is not None and gate.reads:
         raise ControlError("gate.agreement: predictive control reads the force alone; leave it out")
-    if spec.measured not in plant.outputs:
-        raise ControlError(
-            f'measured = "{spec.measured}" is not an output of {plant.name}; {suggestion(spec.measured, plant.outputs)}'
-        )
+    find_rows(plant, spec.measured)  # refuses a name that is no output
     warnings = warn_delays(spec, plant, params)
     spec, values = settle_delays(spec, plant, params, plans=True)
     return _design(plant, values, spec, gate, heat, None, warnings)

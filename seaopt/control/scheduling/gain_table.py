@@ -118,8 +118,7 @@ class GainTable:
 
     def __post_init__(self) -> None:
         check_points(self.over, self.points)
-        if self.structure not in STRUCTURES:
-            raise refuse_structure(self.structure)
+        check_structure(self.structure)
         if unlike := set(self.gains) ^ set(self._list_expected()):
             raise ControlError(
                 f"gains of a schedule are {', '.join(sorted(self.gains))}: {', '.join(sorted(unlike))} is missing or "
@@ -287,10 +286,11 @@ def _list_columns(table: GainTable) -> Mapping[str, PerPoint]:
     return columns
 
 
-def refuse_structure(structure: str) -> ControlError:
-    """Return what is raised of a structure that cannot be scheduled."""
-    names = ", ".join(f'"{name}"' for name in STRUCTURES)
-    return ControlError(f'structure = "{structure}" cannot be scheduled; use one of {names}')
+def check_structure(structure: str) -> None:
+    """Refuse a structure that cannot be scheduled (ControlError)."""
+    if structure not in STRUCTURES:
+        names = ", ".join(f'"{name}"' for name in STRUCTURES)
+        raise ControlError(f'structure = "{structure}" cannot be scheduled; use one of {names}')
 
 
 def check_points(over: str, points: PerPoint) -> None:

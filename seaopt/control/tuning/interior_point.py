@@ -25,7 +25,7 @@ from jaxtyping import Int
 
 from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.structures import evaluate_terms
-from seaopt.control.loops.measured.loop import leave_positive
+from seaopt.control.loops.measured.loop import leave_positive, map_disc
 from seaopt.control.tuning.frequencies import choose_prominent
 from seaopt.control.tuning.grid import FRICTION, Grid, LawResponse, Path, Values
 from seaopt.control.tuning.law_numbers import (
@@ -306,27 +306,17 @@ def _build_program(
 
 
 def _bound_disc(curve: LimitCurve, p: _Complex, open_loop: _Complex, r: Any, c_y: _Complex, c_r: _Complex) -> Any:
-    """Return the logarithm of the largest (of a floor the least) X/(1 + L) of discs: `disc_loop.bound_disc`."""
-    a, reach = open_loop + 1.0, r * ca.sqrt(c_y.square() + SMOOTHING)
-    size, back = a.square() + SMOOTHING, a.conjugate()
+    """Return the logarithm of the largest (of a floor the least) X/(1 + L) of discs, as `bound_disc` has it."""
+    size, reach = (open_loop + 1.0).square() + SMOOTHING, r * _size(c_y)
     room = size * leave_positive(1.0 - reach * reach / size, ca.fmin, ca.fmax)
-    match curve.of:
-        case "1":
-            centre, radius = back, reach
-        case "L":
-            centre, radius = open_loop * back - reach * reach, reach
-        case "1 - L":
-            centre, radius = (1.0 - open_loop) * back + reach * reach, 2.0 * reach
-        case "C_y":
-            centre, radius = c_y * back, reach * ca.sqrt(c_y.square() + SMOOTHING)
-        case "C_v":
-            raise AssertionError("a measured response has no speed loop")
-        case "P C_r":
-            centre = c_r * (p * back - c_y.conjugate() * (r * r))
-            radius = r * ca.sqrt(c_r.square() + SMOOTHING)
-    far = ca.sqrt(centre.square() + SMOOTHING)
+    centre, radius = map_disc(curve.of, p, r, c_y, c_r, open_loop, _size)
+    far = _size(centre)
     top = far * leave_positive(1.0 - radius / far, ca.fmin, ca.fmax) if curve.floor else far + radius
     return ca.log(top / room)
+
+
+def _size(value: _Complex) -> Any:
+    return ca.sqrt(value.square() + SMOOTHING)
 
 
 def _solve(

@@ -18,6 +18,7 @@ known). Between, below and above the points it holds under the assumptions of `s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -160,22 +161,30 @@ def bound_disc(
     open_loop = constant - 1.0 + p * c_y
     a, reach = 1.0 + open_loop, r * np.abs(c_y)
     size = np.abs(a) ** 2
-    room = size * leave_positive(1.0 - reach**2 / np.maximum(size, 1e-300))
-    back = np.conj(a)
+    room = np.maximum(size * leave_positive(1.0 - reach**2 / np.maximum(size, 1e-300)), 1e-300)
+    centre, radius = map_disc(of, p, r, c_y, c_r, open_loop, np.abs)
+    centre = np.abs(centre)
+    return np.maximum(centre - radius, 0.0) / room, (centre + radius) / room
+
+
+def map_disc(
+    of: str, p: Any, r: Any, c_y: Any, c_r: Any, open_loop: Any, size: Callable[[Any], Any]
+) -> tuple[Any, Any]:
+    """Return centre and radius of the module's table, times D; of arrays or expressions, whose `size` is abs."""
+    back, reach = (1.0 + open_loop).conjugate(), r * size(c_y)
     match of:
         case "1":
-            centre, radius = back, reach
+            return back, reach
         case "L":
-            centre, radius = open_loop * back - reach**2, reach
+            return open_loop * back - reach * reach, reach
         case "1 - L":
-            centre, radius = (1.0 - open_loop) * back + reach**2, 2.0 * reach
+            return (1.0 - open_loop) * back + reach * reach, 2.0 * reach
         case "C_y":
-            centre, radius = c_y * back, reach * np.abs(c_y)
+            return c_y * back, reach * size(c_y)
+        case "P C_r":
+            return c_r * (p * back - c_y.conjugate() * (r * r)), r * size(c_r)
         case _:
-            centre, radius = c_r * (p * back - r**2 * np.conj(c_y)), r * np.abs(c_r)
-    centre = np.abs(centre)
-    room = np.maximum(room, 1e-300)
-    return np.maximum(centre - radius, 0.0) / room, (centre + radius) / room
+            raise AssertionError("a measured response has no speed loop")
 
 
 def _first(f: Frequencies, over: Frequencies) -> float | None:
