@@ -29,8 +29,7 @@ from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.friction_loop import FrictionLoop, make_friction_loops
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.loop import Loop, LoopFigures
-from seaopt.control.loops.measured.figures import MeasuredFigures
-from seaopt.control.loops.measured.loop import DiscLoop
+from seaopt.control.loops.measured.loop import DiscLoop, MeasuredFigures
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant, list_names, sample
 from seaopt.control.loops.transfer_function import TransferFunction

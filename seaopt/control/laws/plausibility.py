@@ -170,29 +170,12 @@ class Agreement:
         rate: float = 0.0,
         zero: float = 0.0,
     ) -> Agreement:
-        """Return the check of a plant whose spring is linear.
+        """Return the check of a plant whose spring is linear; of its parameters the std count, of noise and of the
+        model, or that of a prior. `noise`: std of the sensor's noise and of the encoders'. `rate`: how fast the reading
+        moves at most, per second, where the spring is damped. `zero`: how far it may be from what the encoders say at
+        rest. Raises ControlError: the plant has no force sensor, or no encoders beside it, a noise is missing, the
+        spring is not linear, or its stiffness is hardly known.
 
-        Parameters
-        ----------
-        plant, params
-            As fitted: the std of its parameters count, of noise and of the model, or that of a prior.
-        regulated : str
-            The output that a force sensor reads.
-        noise : mapping of str to float
-            Std of its noise and of the encoders'.
-        rate : float
-            How fast it moves at most, per second; counts where the spring is damped.
-        zero : float
-            How far it may be from what the encoders say at rest.
-
-        Raises
-        ------
-        ControlError
-            The plant has no force sensor, or no encoders beside it, a noise is missing, the spring is not linear, or
-            its stiffness is hardly known.
-
-        Examples
-        --------
         >>> import seaopt as so
         >>> known = so.plants.thor().prior(k=3000.0)
         >>> check = Agreement.of_plant(so.plants.high_impedance(), known, "F1", {"F1": 2.0, "q": 1e-6})

@@ -96,36 +96,17 @@ class LawState:
 
 @record(eq=False)
 class Guarded:
-    """A law as it runs, but for the law itself: its limit, and what stands around it.
-
-    Parameters
-    ----------
-    sample_time_s : float
-        Seconds.
-    per_effort : float
-        The command is this times the effort: A/N or A/(N m) of a current.
-    command_limit : float
-        The command's largest magnitude, in its unit; infinite where there is no limit.
-    gate : PlausibilityGate, optional
-        Which readings are believed.
-    command : (str, str)
-        Name and unit of the input that is commanded.
-    heat : HeatGuard, optional
-        What lowers the limit as the winding warms up.
-    compensation : Compensation, optional
-        What is added to reference and effort; it may read further outputs.
-    outer : OuterLoop, optional
-        What makes the law's reference of an x_0, then the reference of every method, and of the link's position. One
-        without a stiffness adds damping to the reference, which stays a force.
-    """
+    """A law as it runs, but for the law itself: its limit, and what stands around it."""
 
     sample_time_s: float
-    per_effort: float
-    command_limit: float
-    gate: PlausibilityGate | None = None
-    command: tuple[str, str] = ("I", "A")
-    heat: HeatGuard | None = None
-    compensation: Compensation | None = None
+    per_effort: float  # the command is this times the effort: A/N or A/(N m) of a current
+    command_limit: float  # the command's largest magnitude, in its unit; infinite where there is no limit
+    gate: PlausibilityGate | None = None  # which readings are believed
+    command: tuple[str, str] = ("I", "A")  # name and unit of the input that is commanded
+    heat: HeatGuard | None = None  # what lowers the limit as the winding warms up
+    compensation: Compensation | None = None  # what is added to reference and effort; it may read further outputs
+    # what makes the law's reference of an x_0, then the reference of every method, and of the link's position; one
+    # without a stiffness adds damping to the reference, which stays a force
     outer: OuterLoop | None = None
 
     @property

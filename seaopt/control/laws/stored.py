@@ -29,7 +29,7 @@ from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMa
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.law import Law
-from seaopt.control.loops.measured.figures import MeasuredFigures
+from seaopt.control.loops.measured.loop import MeasuredFigures
 from seaopt.control.loops.minimal import has_response
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names

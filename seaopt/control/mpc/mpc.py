@@ -45,8 +45,7 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DELAYS, DigitalPlant, find_delay, find_rows, read_conditions, sample
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
-from seaopt.control.mpc.force_plant import ForcePlant
-from seaopt.control.mpc.knots import interpolate_knots, spread_knots
+from seaopt.control.mpc.force_plant import ForcePlant, interpolate_knots, spread_knots
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.output_bounds import SLACK_UNIT, bound_outputs
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, find_plan_bandwidth, tune_regulator

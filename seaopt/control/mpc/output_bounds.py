@@ -24,8 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.mpc.estimator import Estimator
-from seaopt.control.mpc.force_plant import ForcePlant
-from seaopt.control.mpc.knots import spread_knots
+from seaopt.control.mpc.force_plant import ForcePlant, spread_knots
 from seaopt.errors import ControlError, suggestion
 from seaopt.records import record
 

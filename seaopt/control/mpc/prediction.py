@@ -32,8 +32,7 @@ from jaxtyping import Float, Int
 
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.loops.transfer_function import TransferFunction
-from seaopt.control.mpc.force_plant import ForcePlant
-from seaopt.control.mpc.knots import interpolate_knots
+from seaopt.control.mpc.force_plant import ForcePlant, interpolate_knots
 from seaopt.control.mpc.output_bounds import OutputBounds
 from seaopt.errors import ControlError
 from seaopt.records import record

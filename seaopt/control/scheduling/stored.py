@@ -20,7 +20,7 @@ from seaopt.control.laws.stored import (
     Terms,
 )
 from seaopt.control.laws.verdict import PossibleBandwidths
-from seaopt.control.loops.measured.figures import MeasuredFigures
+from seaopt.control.loops.measured.loop import MeasuredFigures
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.scheduling.gain_table import check_points
 from seaopt.control.scheduling.scheduled_controller import PER_POINT, PlaceFigures

@@ -1,4 +1,4 @@
-"""What the tuner knows of its plants at frequencies, and of a law there, as arrays."""
+"""What the tuner knows of its plants, of their friction, and of a law, at frequencies, as arrays."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control.laws.limits import LimitCurve
+from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.measured.loop import bound_disc
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import Frequencies, Response
+from seaopt.plants import Plant
+from seaopt.plants.friction import Friction
 from seaopt.records import record
 
 Curve = Float[np.ndarray, " m"]  # over frequency
@@ -125,3 +128,19 @@ def use_friction(grid: Grid, law: LawResponse) -> dict[str, np.ndarray]:
 def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Frequencies) -> Curve:
     """Return the radii of the discs around a plant's responses; zeros of a model."""
     return plant.discs(f) if isinstance(plant, MeasuredPlant) else np.zeros(f.size)
+
+
+@record(eq=False)
+class PlantWithFriction:
+    """A plant with friction of which a margin is asked, or that grows as it slides."""
+
+    plant: int  # which of the task's plants slides as it does
+    model: Plant  # with its friction
+    loop: FrictionLoop  # with its friction taken out; its own law does not matter
+    flattest: Float[np.ndarray, " p"]  # slope of each friction, N s/m (N m s/rad), which the loop has in it
+    multiplier: str = ""  # of the margin aimed at; empty while none is chosen, and then nothing is asked
+
+    def find_fall(self) -> tuple[Friction, float]:
+        """Return the friction that falls most with speed, and how steeply."""
+        steepest = int(np.argmin(self.flattest))
+        return list(self.model.friction.values())[steepest], -float(self.flattest[steepest])

@@ -82,6 +82,7 @@ from seaopt.control.tuning.grid import (
     Grid,
     LawResponse,
     Path,
+    PlantWithFriction,
     Response,
     Usage,
     measured_discs,
@@ -109,7 +110,6 @@ from seaopt.control.tuning.law_numbers import (
     least_integral_rate,
     warp_frequency,
 )
-from seaopt.control.tuning.plant_with_friction import PlantWithFriction
 from seaopt.records import record
 
 OBJECTIVE_HZ = 0.1  # disturbances count from here

@@ -28,10 +28,10 @@ from seaopt.control.loops.sampled_plant import sample_linear
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import ENCIRCLES, Evolution
 from seaopt.control.tuning.frequencies import count_growing, make_grid, place_frequencies
+from seaopt.control.tuning.grid import PlantWithFriction
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import NEARLY_KEPT, Task
-from seaopt.control.tuning.plant_with_friction import PlantWithFriction
 from seaopt.control.tuning.solution import recheck, solve, tighten_limits
 from seaopt.progress import Progress, ignore
 

@@ -35,8 +35,7 @@ from seaopt.control.loops.compensation.link_feedforward import (
 from seaopt.control.loops.friction_loop import make_friction_loops
 from seaopt.control.loops.law import Law, make_static_law
 from seaopt.control.loops.loop import Loop
-from seaopt.control.loops.measured.figures import measure_all_discs
-from seaopt.control.loops.measured.loop import DiscLoop
+from seaopt.control.loops.measured.loop import DiscLoop, measure_all_discs
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import (
@@ -51,10 +50,9 @@ from seaopt.control.loops.sampled_plant import (
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.frequencies import count_growing
-from seaopt.control.tuning.grid import FRICTION, Response
+from seaopt.control.tuning.grid import FRICTION, PlantWithFriction, Response
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Task, close_plant
-from seaopt.control.tuning.plant_with_friction import PlantWithFriction
 from seaopt.control.tuning.possible_bandwidths import find_largest_fall, find_possible_bandwidths
 from seaopt.control.tuning.solution import ROOM, ease_limits, feed_link, lower_fraction, retry, search, solve
 from seaopt.errors import ControlError, InternalError, SeaoptError, require_number, require_type, suggestion

@@ -14,8 +14,7 @@ from seaopt.control.laws.delay import warn_delays
 from seaopt.control.laws.limits import BY_NAME, MeasuredLoop, PortFigures, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.verdict import judge
-from seaopt.control.loops.measured.figures import measure_discs
-from seaopt.control.loops.measured.loop import DiscLoop
+from seaopt.control.loops.measured.loop import DiscLoop, measure_discs
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY
 from seaopt.control.running.fed_back import close_terms

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 import seaopt as so
 from seaopt.control import MPCSpec, NoiseModel, close_loop, force_mpc, sample
 from seaopt.control.mpc.active_set import INFEASIBLE, SOLVED, UNFINISHED
-from seaopt.control.mpc.knots import interpolate_knots, spread_knots
+from seaopt.control.mpc.force_plant import interpolate_knots, spread_knots
 from seaopt.control.mpc.quadratic_program import QPSolution, QuadraticProgram
 from seaopt.errors import ControlError
 from tests.c_code import CompiledMPC

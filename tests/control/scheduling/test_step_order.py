@@ -29,7 +29,7 @@ from seaopt.control import (
 )
 from seaopt.control.laws.structures import Gains, SpeedLoop
 from seaopt.control.loops.compensation.ripple_term import RippleTerm
-from seaopt.control.loops.measured.figures import MeasuredFigures
+from seaopt.control.loops.measured.loop import MeasuredFigures
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.control.scheduling.runnable_schedule import make_runnable
 from seaopt.errors import ControlError

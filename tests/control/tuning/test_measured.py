@@ -18,8 +18,7 @@ from seaopt.bench import Chirp, Noise
 from seaopt.control import Gains, Loop
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import count_response_samples
-from seaopt.control.loops.measured.figures import measure_discs
-from seaopt.control.loops.measured.loop import LEFT, DiscLoop, bound_disc, leave_positive
+from seaopt.control.loops.measured.loop import LEFT, DiscLoop, bound_disc, leave_positive, measure_discs
 from seaopt.control.loops.measured.plant import sample_measured
 from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError, LogError
