@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 Precision = Literal["double", "float"]
+Writer = Callable[[float], str]  # of a number as C has it
 LARGEST_NUMBER = {"double": np.finfo(np.float64).max, "float": np.finfo(np.float32).max}
 LONGEST_NAME = 25  # C99 promises 31 characters of an external name, and ours end in _reset
 RESERVED = (
@@ -55,7 +56,7 @@ def strip_markup(text: str) -> str:
     return re.sub(r"[^\w .,:;+()<>=/-]", "", str(text), flags=re.ASCII).replace("//", "").strip("/")
 
 
-def literal(precision: Precision) -> Callable[[float], str]:
+def literal(precision: Precision) -> Writer:
     """Return what writes a number as a C literal that reads back as itself (in float: as the nearest float)."""
     if precision == "double":
         return lambda value: repr(float(value))

@@ -9,7 +9,7 @@ about 6e-8 abs(x)/(k_i T_s) (x: the integral's part of the force): take double w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import NoneType
@@ -21,6 +21,7 @@ from seaopt.codec import check_agrees, from_content, to_content
 from seaopt.control.deploy.c_text import (
     LARGEST_NUMBER,
     Precision,
+    Writer,
     check_prefix,
     identifier,
     literal,
@@ -29,14 +30,7 @@ from seaopt.control.deploy.c_text import (
     strip_markup,
 )
 from seaopt.control.deploy.schedule_export import SCHEDULE_TEMPLATES, describe_schedule, read_runnable
-from seaopt.control.deploy.target import (
-    LOG_TEMPLATES,
-    TARE_TEMPLATES,
-    Tare,
-    describe_log,
-    describe_tare,
-    hash_law,
-)
+from seaopt.control.deploy.target import LOG_TEMPLATES, TARE_TEMPLATES, Tare, describe_log, describe_tare, hash_law
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
@@ -290,7 +284,7 @@ def _describe(stored: Controller, law: RunnableLaw | RunnableSchedule) -> dict[s
     }
 
 
-def _write_gate(gate: PlausibilityGate, sample_time_s: float, number: Callable[[float], str]) -> dict[str, Any]:
+def _write_gate(gate: PlausibilityGate, sample_time_s: float, number: Writer) -> dict[str, Any]:
     """Return a gate's numbers, exact for the code and rounded for what is read."""
     (low, high), agreement = gate.range_N, gate.agreement
     exact = {"low": low, "high": high, "step": gate.max_step_N, "ramp": gate.ramp_A_per_s * sample_time_s}
@@ -325,7 +319,7 @@ def _list_units(stored: Controller) -> dict[str, str]:
 
 
 def _write_numbers(
-    stored: Controller, law: RunnableLaw | RunnableSchedule, number: Callable[[float], str], precision: Precision
+    stored: Controller, law: RunnableLaw | RunnableSchedule, number: Writer, precision: Precision
 ) -> dict[str, Any]:
     """Return what surrounds any law as text: what it reads, limits, guards, terms, outer loop."""
     others = [strip_markup(name) for name in stored.signals[1:]]
@@ -364,7 +358,7 @@ def _write_numbers(
     }
 
 
-def _numbers(stored: Controller, law: RunnableLaw, number: Callable[[float], str]) -> dict[str, Any]:
+def _numbers(stored: Controller, law: RunnableLaw, number: Writer) -> dict[str, Any]:
     """Return the numbers of one law as text; a law without states is given one that stays zero."""
 
     def row(values: Iterable[float]) -> str:
@@ -417,7 +411,7 @@ def _numbers(stored: Controller, law: RunnableLaw, number: Callable[[float], str
     }
 
 
-def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, Any]:
+def _write_outer(outer: OuterLoop, number: Writer) -> dict[str, Any]:
     """Return the numbers of the outer loop as text, its direction in the gains."""
     return {
         "stiffness": number(outer.direction * outer.stiffness),
@@ -432,7 +426,7 @@ def _write_outer(outer: OuterLoop, number: Callable[[float], str]) -> dict[str, 
     }
 
 
-def _write_friction(term: FrictionTerm, sample_time_s: float, number: Callable[[float], str]) -> dict[str, str]:
+def _write_friction(term: FrictionTerm, sample_time_s: float, number: Writer) -> dict[str, str]:
     """Return the compensation of friction as text."""
     return {
         "effort": number(term.effort),
@@ -445,7 +439,7 @@ def _write_friction(term: FrictionTerm, sample_time_s: float, number: Callable[[
     }
 
 
-def _write_gravity(term: GravityTerm, number: Callable[[float], str]) -> dict[str, Any]:
+def _write_gravity(term: GravityTerm, number: Writer) -> dict[str, Any]:
     """Return the compensation of gravity as text."""
     middle, scale, *coefficients = term.numbers
     return {
@@ -460,7 +454,7 @@ def _write_gravity(term: GravityTerm, number: Callable[[float], str]) -> dict[st
     }
 
 
-def _write_ripple(term: RippleTerm, number: Callable[[float], str]) -> dict[str, Any]:
+def _write_ripple(term: RippleTerm, number: Writer) -> dict[str, Any]:
     """Return the compensation of torque ripple as text, every harmonic up to the last."""
     series = {n: (cos, sin) for n, cos, sin in zip(term.cycles, term.cos, term.sin, strict=True)}
     rows = [series.get(n, (0.0, 0.0)) for n in range(1, max(term.cycles) + 1)]

@@ -8,13 +8,13 @@ finite is replaced by the last that was, or by the table's `fallback` where ther
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from seaopt.control.deploy.c_text import identifier, name_unit, strip_markup
+from seaopt.control.deploy.c_text import Writer, identifier, name_unit, strip_markup
 from seaopt.control.deploy.trace import Term, Trace
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
@@ -56,7 +56,7 @@ def read_runnable(
     return law, first
 
 
-def describe_schedule(law: RunnableSchedule, first: Controller, number: Callable[[float], str]) -> dict[str, Any]:
+def describe_schedule(law: RunnableSchedule, first: Controller, number: Writer) -> dict[str, Any]:
     """Return words and numbers of the table, and the step traced."""
     table = law.table
     units = name_gain_units(first.command) | dict.fromkeys(CORNERS.values(), WARPED)
@@ -83,9 +83,7 @@ def describe_schedule(law: RunnableSchedule, first: Controller, number: Callable
     }
 
 
-def _trace(
-    law: RunnableSchedule, asked: str, columns: list[str], signals: list[str], number: Callable[[float], str]
-) -> dict[str, Any]:
+def _trace(law: RunnableSchedule, asked: str, columns: list[str], signals: list[str], number: Writer) -> dict[str, Any]:
     """Return step and reset as lines of C, and what they are given and keep."""
     order = law.table.order
     states = list(law.table.states)
@@ -99,12 +97,7 @@ def _trace(
     trace, gains, x, reference, readings = begin(asked, "reading")
     reference, added = _compensate(law, gains, reference, _REMEMBERED)
     effort, applied, after = order.step(
-        gains,
-        x,
-        reference,
-        readings,
-        lambda effort: trace.keep(f"limited({effort.text}, most)", [effort.text]),
-        added,
+        gains, x, reference, readings, lambda effort: trace.keep(f"limited({effort.text}, most)", [effort.text]), added
     )
     results = [trace.write(value) for value in (effort, applied, *after.values())]
     step = trace.list_needed(results)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
+
+from seaopt.control.deploy.c_text import Writer
 
 SIGNS = {np.add: "+", np.subtract: "-", np.multiply: "*", np.true_divide: "/"}
 
@@ -29,7 +31,7 @@ class Term(NDArrayOperatorsMixin):
 class Trace:
     """The operations so far, each a constant of C with the names that it is made of."""
 
-    number: Callable[[float], str]  # writes a number as C has it
+    number: Writer
     lines: dict[str, tuple[str, list[str]]] = field(default_factory=dict)
 
     def combine(self, left: Any, sign: str, right: Any) -> Term:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, replace
 from functools import partial
@@ -19,7 +19,7 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import feed_link, lower_fraction, search, solve
-from seaopt.control.tuning.tuner import RobustTo, aim_task, disturbance, make_controller, make_task, name_design
+from seaopt.control.tuning.tuner import Draws, RobustTo, aim_task, disturbance, make_controller, make_task, name_design
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor, map_ordered
@@ -109,7 +109,7 @@ def sweep(
     bandwidths_hz: Sequence[float],
     robust_to: RobustTo | None = None,
     *,
-    draws: Sequence[Mapping[str, float]] = (),
+    draws: Draws = (),
     free_law: bool = False,
     executor: Executor | None = None,
     progress: Progress = ignore,
@@ -243,11 +243,7 @@ def _solve_chain(swept: _Sweep, chain: Sequence[ControllerSpec], progress: Progr
 
 
 def _make_sliding_task(
-    plant: Plant | MeasuredResponse,
-    params: ParameterSet,
-    spec: ControllerSpec,
-    robust_to: RobustTo,
-    draws: Sequence[Mapping[str, float]],
+    plant: Plant | MeasuredResponse, params: ParameterSet, spec: ControllerSpec, robust_to: RobustTo, draws: Draws
 ) -> Task:
     """Return the task on the sliding plants alone; measured ones are what they are."""
     sliding: dict[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse] = {}

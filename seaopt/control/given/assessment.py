@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,7 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.sampled_plant import find_signals, list_names
-from seaopt.control.tuning.tuner import RobustTo, describe_law, make_task, name_design
+from seaopt.control.tuning.tuner import Draws, RobustTo, describe_law, make_task, name_design
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.frequency import MeasuredResponse
@@ -29,7 +28,7 @@ def assess(
     spec: ControllerSpec,
     robust_to: RobustTo | None = None,
     *,
-    draws: Sequence[Mapping[str, float]] = (),
+    draws: Draws = (),
 ) -> Controller:
     """Measure a law of one's own against a specification; the controller that it makes is certified and exported alike.
 

@@ -39,7 +39,7 @@ from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import Solution, recheck, solve
-from seaopt.control.tuning.tuner import RobustTo, make_controller, make_task, tune
+from seaopt.control.tuning.tuner import Draws, RobustTo, make_controller, make_task, tune
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.frequency import MeasuredResponse
@@ -60,7 +60,7 @@ def tune_schedule(
     robust_to: RobustTo | None = None,
     *,
     bandwidths_hz: Sequence[float] | None = None,
-    draws: Sequence[Mapping[str, float]] = (),
+    draws: Draws = (),
     progress: Progress = ignore,
 ) -> ScheduledController:
     """Tune a controller per point of a scheduling variable, with gains that are interpolated between the points.

@@ -81,6 +81,7 @@ NO_FORCE = 0.02  # of the design plant's static gain: where the force answers le
 USUAL_MS = 1.7  # that the fraction of a feedforward is chosen for where no Ms is asked
 SOLUTION, BANDWIDTHS, EASING = 1.0, 2.0, 2.0  # of the time of a tune that is not possible as asked
 
+Draws = Sequence[Mapping[str, float]]  # of values by parameter
 RobustTo = Mapping[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse]
 
 
@@ -90,7 +91,7 @@ def tune(
     spec: ControllerSpec,
     robust_to: RobustTo | None = None,
     *,
-    draws: Sequence[Mapping[str, float]] = (),
+    draws: Draws = (),
     progress: Progress = ignore,
 ) -> Controller:
     """Tune a digital force controller.
@@ -159,11 +160,7 @@ def tune(
 
 
 def _describe_request(
-    plant: Plant | MeasuredResponse,
-    params: Fit | ParameterSet,
-    spec: ControllerSpec,
-    robust_to: RobustTo,
-    draws: Sequence[Mapping[str, float]],
+    plant: Plant | MeasuredResponse, params: Fit | ParameterSet, spec: ControllerSpec, robust_to: RobustTo, draws: Draws
 ) -> str:
     """Return what it takes to repeat a call."""
     values = params.parameters if isinstance(params, Fit) else params
@@ -180,7 +177,7 @@ def _tune(
     params: Fit | ParameterSet,
     spec: ControllerSpec,
     robust_to: RobustTo,
-    draws: Sequence[Mapping[str, float]],
+    draws: Draws,
     progress: Progress,
 ) -> Controller:
     model = name_design(plant)
@@ -254,11 +251,7 @@ def _find_possible(
 
 
 def make_task(
-    plant: Plant | MeasuredResponse,
-    params: ParameterSet,
-    spec: ControllerSpec,
-    robust_to: RobustTo,
-    draws: Sequence[Mapping[str, float]] = (),
+    plant: Plant | MeasuredResponse, params: ParameterSet, spec: ControllerSpec, robust_to: RobustTo, draws: Draws = ()
 ) -> Task:
     """Return the task of a request. Raises ControlError: as `tune`."""
     design = name_design(plant)
@@ -455,7 +448,7 @@ def _find_friction(
 
 
 def _draw_plants(
-    models: Mapping[str, tuple[Plant, CompletedParameters]], draws: Sequence[Mapping[str, float]]
+    models: Mapping[str, tuple[Plant, CompletedParameters]], draws: Draws
 ) -> list[tuple[str, tuple[Plant, CompletedParameters]]]:
     """Return every plant at every draw, under a name; a draw that changes nothing of a plant is left out."""
     names = {name for model, _ in models.values() for name in (*model.parameters, *conditions((model,)))}
