@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Annotated
 
 from seaopt.codec import Constraints
+from seaopt.control.laws.delay import LoopSpec
 from seaopt.control.laws.structures import PREFILTER
 from seaopt.control.loops.sampled_plant import static_gain
 from seaopt.errors import ControlError
@@ -151,13 +152,13 @@ def command_of(plant: Plant, params: ParameterSet, measured: str) -> Command:
     )
 
 
-def limit_notes(command: Command, requested: float | None, *, in_amperes: bool = True) -> tuple[str, ...]:
+def limit_notes(command: Command, spec: LoopSpec) -> tuple[str, ...]:
     """Say which quantity a limit holds where no current is commanded, and where the command's own range is narrower."""
-    notes: list[str] = []
-    key = "current_limit_A" if in_amperes else "command_limit"
-    if requested is not None and in_amperes and command.unit != "A":
+    notes, requested = list[str](), spec.limit_asked
+    key = "command_limit" if spec.current_limit_A is None else "current_limit_A"
+    if spec.current_limit_A is not None and command.unit != "A":
         notes.append(
-            f"current_limit_A = {requested:g} limits the command, {requested:g}{unit_after(command.unit)} of "
+            f"{key} = {requested:g} limits the command, {requested:g}{unit_after(command.unit)} of "
             f"{command.input}, not the current itself; command_limit is the same under its own name"
         )
     if command.largest is not None and (requested is None or requested > command.largest):

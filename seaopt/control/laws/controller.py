@@ -304,7 +304,7 @@ class Controller(ClosesLoops, Result, Worded):
             notes.append("the design plant has no friction at these values: any min_friction_margin holds on it")
         notes += actuation_notes(plant, self.command)
         notes += self._scale_notes(plant, values)
-        notes += limit_notes(self.command, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None)
+        notes += limit_notes(self.command, self.spec)
         return (*notes, *self._noise_notes(), *self._rest_notes(), *self._slow_notes())
 
     def _scale_notes(self, plant: Plant, values: ParameterSet) -> Iterator[str]:

@@ -248,7 +248,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
         proof = () if self.friction is None else (f"{self.friction}, while no limit is active",)
-        limit = limit_notes(self.actuation, self.spec.limit_asked, in_amperes=self.spec.current_limit_A is not None)
+        limit = limit_notes(self.actuation, self.spec)
         return (*self.spec.lifted_notes, *self.warnings, *limit, *self._filter_notes(), *proof)
 
     def _filter_notes(self) -> tuple[str, ...]:

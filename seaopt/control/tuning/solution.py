@@ -255,9 +255,7 @@ def recheck(task: Task, grid: Grid, x: LawNumbers, rounds: int = ROUNDS) -> LawN
     return x
 
 
-def find_best(
-    task: Task, grid: Grid, warm: Sequence[LawNumbers] = (), progress: Progress = ignore, far_off: float = FAR_OFF
-) -> LawNumbers:
+def find_best(task: Task, grid: Grid, warm: Sequence[LawNumbers], progress: Progress, far_off: float) -> LawNumbers:
     """Find the best numbers on a grid; `far_off` is of `solve`."""
     scanning, improving, refining = divide(progress, SCAN, IMPROVEMENT, REFINEMENT)
     scanning("scanning gains", 0.0)
