@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 
 from seaopt.errors import LogError
 from seaopt.records import record
@@ -16,6 +16,10 @@ VectorN = Float[np.ndarray, " n"]
 VectorM = Float[np.ndarray, " m"]
 VectorK = Float[np.ndarray, " k"]
 VectorX = Float[np.ndarray, " nx"]
+MatrixNN = Float[np.ndarray, "n n"]
+MatrixMN = Float[np.ndarray, "m n"]
+ComplexM = Complex[np.ndarray, " m"]
+ComplexN = Complex[np.ndarray, " n"]
 RowsK = Int[np.ndarray, " k"]
 
 # What channels are called where nobody says what they are, in any case.

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.signals import VectorK, VectorM
+
 ROUNDING_DISTANCE = 1e-11  # of a frequency: nearer, values of a curve differ by rounding, which would hide a minimum
 
 
-def find_crossings(
-    curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: Float[np.ndarray, " m"]
-) -> Float[np.ndarray, " k"]:
+def find_crossings(curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: VectorM) -> VectorK:
     """Return the zeros of a curve, ascending; two between the same two points of the grid are not seen."""
     from scipy.optimize import elementwise
 
@@ -22,10 +22,8 @@ def find_crossings(
 
 
 def add_minima(
-    curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]],
-    f: Float[np.ndarray, " m"],
-    shallow: float = np.inf,
-) -> Float[np.ndarray, " k"]:
+    curve: Callable[[Float[np.ndarray, " _"]], Float[np.ndarray, " _"]], f: VectorM, shallow: float = np.inf
+) -> VectorK:
     """Return f with every local minimum of the curve on that grid, refined by thirds, ascending. Who looks for
     crossings of zero can leave out minima that do not reach it: on the grid they are above zero by more than `shallow`
     times what they are below their neighbours.

@@ -29,6 +29,7 @@ from seaopt.plants.friction import remembers
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import jacobians
 from seaopt.plants.roles import Friction
+from seaopt.signals import MatrixMN, MatrixNN, VectorN
 
 PLACES = 4  # states, inputs and parameters at random where the equations are looked at
 SEED = 1
@@ -36,7 +37,7 @@ ROUNDING = 1e-9  # of a column's size
 CANCELLED = 1e-13  # of a row's largest slope
 
 
-Slopes = list[tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "y n"], Any]]
+Slopes = list[tuple[MatrixNN, Float[np.ndarray, "y n"], Any]]
 
 
 @memo
@@ -61,7 +62,7 @@ def leave_out_drift(plant: Plant, measured: str | tuple[str, ...]) -> Plant:
     return plant if names & telling else leave_out_drift(_take_out(plant, shifts, telling), measured)
 
 
-def _depends(block: Float[np.ndarray, "m n"], v: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " m"]:
+def _depends(block: MatrixMN, v: VectorN) -> Bool[np.ndarray, " m"]:
     """Tell which rows of slopes depend on a direction."""
     return np.abs(block @ v) > ROUNDING * (np.abs(block) @ np.abs(v)) + 1e-300
 
@@ -81,7 +82,7 @@ def _sample_slopes(plant: Plant) -> Slopes:
     return slopes
 
 
-def _clean(block: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+def _clean(block: MatrixMN) -> MatrixMN:
     """Return slopes without what terms that cancel leave of each other in a row."""
     return np.where(np.abs(block) > CANCELLED * np.max(np.abs(block), axis=1, keepdims=True), block, 0.0)
 

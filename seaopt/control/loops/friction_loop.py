@@ -30,6 +30,7 @@ from seaopt.plants.friction import SLIDING, find_bristle_stiffness, friction_mat
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
+from seaopt.signals import MatrixNN, VectorM, VectorN
 
 FUNDAMENTAL = np.zeros(1, dtype=int)  # the order of the angle itself
 
@@ -38,8 +39,8 @@ FUNDAMENTAL = np.zeros(1, dtype=int)  # the order of the angle itself
 class FrictionLoop:
     r"""A sampled loop with its friction taken out: :math:`\dot x = A x + b u - B_f \varphi(v)`, v = C_v x, y = C x."""
 
-    a: Float[np.ndarray, "n n"]  # a, motor: the continuous plant without friction, and the effect of the motor effort u
-    motor: Float[np.ndarray, " n"]
+    a: MatrixNN  # a, motor: the continuous plant without friction, and the effect of the motor effort u
+    motor: VectorN
     friction: Float[np.ndarray, "n p"]  # the effect of each friction effort in the direction of its velocity
     # velocity, sensed: the velocities that friction acts on, and the outputs that the law reads, the regulated first
     velocity: Float[np.ndarray, "p n"]
@@ -76,7 +77,7 @@ class FrictionLoop:
         return int(ports[0]) if ports.size == 1 else None
 
     def respond(
-        self, theta: Float[np.ndarray, " m"], orders: Int[np.ndarray, " k"], seen: Float[np.ndarray, "y n"]
+        self, theta: VectorM, orders: Int[np.ndarray, " k"], seen: Float[np.ndarray, "y n"]
     ) -> FrictionResponse:
         """Return what friction efforts and motor commands do to some rows of the states, the loop open. `theta`:
         angles, 2 pi times frequency over sample rate. `orders`: which aliases: that of order k is theta + 2 pi k.
@@ -91,7 +92,7 @@ class FrictionLoop:
             drive = drive * np.exp(-s * self.delay_s)
         return FrictionResponse(by_friction=response[..., :-1], by_motor=response[..., -1] * drive[..., None])
 
-    def feedback(self, theta: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "y m"]:
+    def feedback(self, theta: VectorM) -> Complex[np.ndarray, "y m"]:
         """Return K, the motor command per measured output that comes from elsewhere, with the loop closed."""
         f = theta / (2 * np.pi * self.plant.sample_time_s)
         return self.law.feedback_responses(f) * self.sampled.sensitivity(f)
@@ -157,7 +158,7 @@ def _differentiate(plant: Plant) -> tuple[ca.SX, tuple[int, ...]]:
     return ca.jacobian(ca.vertcat(plant.dynamics, plant.output), ca.vertcat(plant.x, plant.u)), turning
 
 
-def _check_linear(plant: Plant, at_rest: Float[np.ndarray, " n"], values: Float[np.ndarray, " p"]) -> tuple[bool, bool]:
+def _check_linear(plant: Plant, at_rest: VectorN, values: Float[np.ndarray, " p"]) -> tuple[bool, bool]:
     """Tell whether a plant is linear once links that turn stay about their rest; and whether some link then does."""
     slopes, turning = _differentiate(plant)
     variables = ca.vertcat(plant.x, plant.u)

@@ -48,6 +48,7 @@ from seaopt.control.systems.resolvent import Resolvent
 from seaopt.errors import ControlError
 from seaopt.formatting import format_count
 from seaopt.records import record
+from seaopt.signals import ComplexN, MatrixNN, VectorK, VectorN
 
 SLOW_LAG = 1e-3  # distance from 1 of a pole that may have been meant to be an integrator
 SAME_POLE = 1e-3  # to which poles that are equal are computed
@@ -83,10 +84,10 @@ class Law:
     (1, [[1.0, -1.0]], [2.5, -2.5])
     """
 
-    a: Float[np.ndarray, "n n"]
+    a: MatrixNN
     b: Float[np.ndarray, "n k"]
-    c: Float[np.ndarray, " n"]
-    d: Float[np.ndarray, " k"]
+    c: VectorN
+    d: VectorK
     sample_time_s: float
 
     @property
@@ -108,13 +109,13 @@ class Law:
         return self.a[m:, m:], self.b[m:], self.c[m:]
 
     @property
-    def static_rest(self) -> Float[np.ndarray, " k"]:
+    def static_rest(self) -> VectorK:
         """The part that does not integrate, at 0 Hz: effort per reference and per measured signal."""
         a, b, c = self.rest
         return self.d + c @ np.linalg.solve(np.eye(c.size) - a, b)
 
     @property
-    def poles(self) -> Complex[np.ndarray, " n"]:
+    def poles(self) -> ComplexN:
         """The eigenvalues of `a`, those of the chain exactly 1."""
         return np.concatenate([np.ones(self.integrators), np.linalg.eigvals(self.rest[0])]).astype(complex)
 
@@ -189,12 +190,7 @@ class Law:
 
     @classmethod
     def from_state_space(
-        cls,
-        a: Float[np.ndarray, "n n"],
-        b: Float[np.ndarray, "n k"],
-        c: Float[np.ndarray, " n"],
-        d: Float[np.ndarray, " k"],
-        sample_time_s: float,
+        cls, a: MatrixNN, b: Float[np.ndarray, "n k"], c: VectorN, d: VectorK, sample_time_s: float
     ) -> Law:
         """Return the balanced law of a state space in any coordinates, with what integrates set apart.
 
@@ -371,7 +367,7 @@ def _set_apart(original: Law) -> Law:
     return balanced if _is_same(balanced, original) else original
 
 
-def _settle(chain: Float[np.ndarray, "m k"], slowest: Float[np.ndarray, " k"]) -> Float[np.ndarray, "l k"]:
+def _settle(chain: Float[np.ndarray, "m k"], slowest: VectorK) -> Float[np.ndarray, "l k"]:
     """Return a chain's gains without what rounding made: differences of two, and integrals of nothing. Those of
     reference and regulated signal are alike, or that of the reference zero, where only rounding parts them; a last
     integral is left out that is below rounding in the response at `LOWEST`, `slowest`.
@@ -396,7 +392,7 @@ def _is_same(law: Law, original: Law, share: float = RESPONSE_TOLERANCE) -> bool
     return bool(np.all(np.abs(response - wanted) <= share * size + ROUNDED * above + TINY))
 
 
-def _in_delay(num: Float[np.ndarray, " n"], den: Frequencies) -> TransferFunction:
+def _in_delay(num: VectorN, den: Frequencies) -> TransferFunction:
     """Return a transfer function of z, descending powers, as one of q = 1/z."""
     num, den = np.trim_zeros(np.asarray(num, dtype=float), "f"), np.trim_zeros(np.asarray(den, dtype=float), "f")
     if num.size > den.size:

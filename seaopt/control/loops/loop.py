@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Complex, Float
 
 from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.law import Law
@@ -23,6 +22,7 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.formatting import format_number
 from seaopt.records import record
+from seaopt.signals import ComplexN, VectorK, VectorN
 
 if TYPE_CHECKING:
     import control
@@ -165,7 +165,7 @@ class Loop:
         ts = self.plant.sample_time_s
         return control.StateSpace(system.a, system.b, system.c, system.d, ts, name="loop", **names)
 
-    def eigenvalues(self) -> Complex[np.ndarray, " n"]:
+    def eigenvalues(self) -> ComplexN:
         """Return the closed loop's eigenvalues."""
         return self.system().poles
 
@@ -184,7 +184,7 @@ class Loop:
         samples = max(round(seconds / self.plant.sample_time_s), 0)
         return float(c @ np.linalg.matrix_power(a, samples) @ np.linalg.solve(np.eye(b.size) - a, b))
 
-    def simulate(self, reference: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    def simulate(self, reference: VectorN) -> tuple[VectorN, VectorN]:
         """Return what is measured, and the effort, at each sample of a reference, from rest; linear.
 
         Examples
@@ -209,12 +209,12 @@ class Loop:
         """Return frequencies that resolve every pole of plant and closed loop, up to the Nyquist frequency."""
         return self._make_grid(self.eigenvalues())
 
-    def _make_grid(self, poles: Complex[np.ndarray, " n"]) -> Frequencies:
+    def _make_grid(self, poles: ComplexN) -> Frequencies:
         """Return the grid, of the closed loop's eigenvalues."""
         base = np.geomspace(GRID_LOWEST_HZ, self.plant.nyquist_hz, 1200)
         return np.union1d(base, self.about(np.concatenate([np.linalg.eigvals(self.plant.a), poles])))
 
-    def about(self, poles: Complex[np.ndarray, " n"]) -> Frequencies:
+    def about(self, poles: ComplexN) -> Frequencies:
         """Return frequencies that resolve poles, up to the Nyquist frequency, unsorted."""
         nyquist = self.plant.nyquist_hz
         f0 = np.abs(np.angle(poles)) / (2 * np.pi * self.plant.sample_time_s)
@@ -284,11 +284,11 @@ def _droop_db(least: float, static: float) -> float:
     return -20.0 * float(np.log10(least / static)) if least > 0.0 else np.inf
 
 
-def _least(sizes: Float[np.ndarray, " k"]) -> float | None:
+def _least(sizes: VectorK) -> float | None:
     return float(np.min(np.abs(sizes))) if sizes.size else None
 
 
-def _tracking_band(system: ClosedLoop, inner: Float[np.ndarray, " k"]) -> tuple[float, float] | None:
+def _tracking_band(system: ClosedLoop, inner: VectorK) -> tuple[float, float] | None:
     edges = np.concatenate([[0.0], inner, [np.pi]])
     middles = 0.5 * (edges[:-1] + edges[1:])
     size = np.abs(system.curves(middles)[TRACKING])

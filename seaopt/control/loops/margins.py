@@ -21,13 +21,13 @@ from __future__ import annotations
 from dataclasses import field
 
 import numpy as np
-from jaxtyping import Float
 
 from seaopt.control.loops.crossings import add_minima
 from seaopt.control.loops.loop import GRID_LOWEST_HZ, GROWING, STABLE, Loop
 from seaopt.control.loops.peaks import find_extremes
 from seaopt.errors import ControlError
 from seaopt.records import record
+from seaopt.signals import VectorM
 
 ON_THE_CIRCLE = 1e-10  # distance of a pole from 1 that is rounding
 SETTLED_DECADES, POINTS_PER_DECADE = 3.0, 30  # below the lowest pole, where a response is a power law
@@ -207,7 +207,7 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
     return float(chord[worst]), float(f[worst])
 
 
-def _low_frequencies(loops: tuple[Loop, Loop]) -> Float[np.ndarray, " m"]:
+def _low_frequencies(loops: tuple[Loop, Loop]) -> VectorM:
     """Return frequencies from where both loop gains are as they are at 0 Hz, a power law, up to their usual grid."""
     period = loops[0].plant.sample_time_s
     poles = np.concatenate([each for loop in loops for each in (loop.system().opened, loop.system().poles)])
@@ -223,6 +223,6 @@ def _count_integrators(loop: Loop) -> int:
     return int(np.sum(np.abs(system.opened - 1.0) <= np.maximum(system.resolution(), ON_THE_CIRCLE)))
 
 
-def _chord(first: Loop, second: Loop, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+def _chord(first: Loop, second: Loop, f: VectorM) -> VectorM:
     l1, l2 = first.open_loop(f), second.open_loop(f)
     return np.abs(l1 - l2) / np.sqrt((1.0 + np.abs(l1) ** 2) * (1.0 + np.abs(l2) ** 2))

@@ -24,6 +24,7 @@ from jaxtyping import Complex, Float
 
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.errors import ControlError
+from seaopt.signals import VectorK, VectorM
 
 EPS = float(np.finfo(float).eps)
 POLE_AT_ONE = 64 * EPS  # a denominator this small at q = 1, against its coefficients, has a root there
@@ -39,7 +40,7 @@ VANISHED = 1e-18  # a power of A this small adds nothing to a Gramian
 Vector = Float[np.ndarray, " n"]  # coefficients of a polynomial, or a row of states
 Matrix = Float[np.ndarray, "n n"]
 Inputs = Float[np.ndarray, "n k"]
-Split = tuple[Float[np.ndarray, " m"], Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # g_1 ... g_m, Y and R
+Split = tuple[VectorM, Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # g_1 ... g_m, Y and R
 
 
 def split(name: str, tf: TransferFunction) -> Split:
@@ -135,7 +136,7 @@ def build_chain(
 
 def has_response(
     tf: TransferFunction,
-    response: Callable[[Float[np.ndarray, " k"]], Complex[np.ndarray, " k"]],
+    response: Callable[[VectorK], Complex[np.ndarray, " k"]],
     sample_time_s: float,
     roundings: float = 256.0,
 ) -> bool:
@@ -193,7 +194,7 @@ def split_integrators(
         yield chain, far, into[m:], out[m:] + read @ link
 
 
-def read_companion(a: Matrix, b: Inputs, c: Vector, d: Float[np.ndarray, " k"]) -> list[TransferFunction]:
+def read_companion(a: Matrix, b: Inputs, c: Vector, d: VectorK) -> list[TransferFunction]:
     """Return the transfer function of each input of a companion form, whose entries are coefficients; of others none.
     The coefficients may stand in the first or last row (controllable) or column (observable).
     """
@@ -240,7 +241,7 @@ def _flip(polynomial: Vector) -> Vector:
     return out
 
 
-def _expand(num: Vector, den: Float[np.ndarray, " k"], terms: int) -> Float[np.ndarray, " terms"]:
+def _expand(num: Vector, den: VectorK, terms: int) -> Float[np.ndarray, " terms"]:
     """Return the first terms of num/den in powers of 1 - q."""
     top, bottom = (np.concatenate([_flip(p), np.zeros(terms)]) for p in (num, den))
     out = np.zeros(terms)
@@ -251,7 +252,7 @@ def _expand(num: Vector, den: Float[np.ndarray, " k"], terms: int) -> Float[np.n
 
 def balance(
     a: Matrix, b: Inputs, c: Vector, gain: float
-) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m k"], Float[np.ndarray, " m"]]:
+) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m k"], VectorM]:
     """Return a stable system balanced and of least order. What is below `NEGLIGIBLE_HANKEL` of `gain`, or of the
     largest Hankel singular value, is rounding. Raises LinAlgError: a pole is so close to the unit circle that a Gramian
     is not finite.

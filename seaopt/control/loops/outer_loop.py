@@ -14,13 +14,14 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from seaopt.codec import Constraints
 from seaopt.control.systems.block import Block
 from seaopt.errors import ControlError
 from seaopt.options import check_options, option
 from seaopt.records import record
+from seaopt.signals import ComplexM, VectorM
 from seaopt.units import mechanics_of
 
 POSITION, SPEED = "position", "speed"  # of the link
@@ -174,11 +175,11 @@ class OuterLoop:
         a, rate = np.full((1, 1), self.pole), self.rate
         return Block(a=a, b=rate * (a - 1.0), c=np.ones((1, 1)), d=rate + 0.0 * a, inputs=(POSITION,), outputs=(SPEED,))
 
-    def difference(self, z: Complex[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def difference(self, z: ComplexM) -> ComplexM:
         """Return D at points of the z plane."""
         return self.rate * (z - 1.0) / (z - self.pole)
 
-    def difference_slope(self, z: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    def difference_slope(self, z: VectorM) -> VectorM:
         """Return dD/dz."""
         return self.rate * (1.0 - self.pole) / (z - self.pole) ** 2
 

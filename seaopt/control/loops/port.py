@@ -20,6 +20,7 @@ from seaopt.plants import Plant, state_space
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import share_drive
 from seaopt.records import record
+from seaopt.signals import ComplexN, MatrixNN, VectorN
 from seaopt.units import LINEAR
 
 BESIDE = 1e-7  # of a pole: nearer, the response is evaluated this far beside it
@@ -52,9 +53,9 @@ class PortResponse:
 class PortModel:
     """A linearised plant whose port is moved, its other links held."""
 
-    a: Float[np.ndarray, "n n"]  # a, motor, force: x' = a x + motor F_m + force F_e, shapes (n, n), (n,), (n,)
-    motor: Float[np.ndarray, " n"]
-    force: Float[np.ndarray, " n"]
+    a: MatrixNN  # a, motor, force: x' = a x + motor F_m + force F_e, shapes (n, n), (n,), (n,)
+    motor: VectorN
+    force: VectorN
     read: Float[np.ndarray, "y n+2"]  # every signal that the law reads, the regulated force first, of x, F_m and F_e
     speed: int  # speed, place: which states are the port's speed and its position
     place: int
@@ -86,8 +87,8 @@ class PortModel:
         )
 
     def load(
-        self, taken: Float[np.ndarray, " n"], pushed: float
-    ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, "y n"], Float[np.ndarray, " y"]]:
+        self, taken: VectorN, pushed: float
+    ) -> tuple[MatrixNN, VectorN, Float[np.ndarray, "y n"], Float[np.ndarray, " y"]]:
         """Return the plant from motor force to what is read, its port loaded: F_e = taken x + pushed F_m."""
         n, of_force = self.motor.size, self.read[:, -1]
         a, b = self.a + np.outer(self.force, taken), self.motor + self.force * pushed
@@ -104,7 +105,7 @@ class PortModel:
         (plant,) = sample_linear(linear, np.array([self.delay_s]), sample_time_s, delay_samples)
         return plant
 
-    def find_poles(self) -> Complex[np.ndarray, " n"]:
+    def find_poles(self) -> ComplexN:
         """Return the poles with link 2 at rest (rad/s)."""
         moved = self.load(-self.a[self.speed] / self.force[self.speed], 0.0)[0]
         return np.linalg.eigvals(moved).astype(complex)

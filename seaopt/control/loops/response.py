@@ -43,6 +43,7 @@ from seaopt.control.loops.law import Law
 from seaopt.control.systems.block import COMMAND, EFFORT, REFERENCE, Block, connect
 from seaopt.control.systems.resolvent import Resolvent
 from seaopt.records import record
+from seaopt.signals import ComplexM, ComplexN, MatrixNN, VectorK, VectorN
 
 SHIFTS = (1.5, -1.7)  # of the pencils' inverse: real, off the circle
 CROSSING_DISTANCE = 3e-7  # how far from an eigenvalue a crossing is looked for first, as a fraction of the angle
@@ -64,8 +65,8 @@ class Curves:
 
     outputs: Int[np.ndarray, " k"]
     inputs: Int[np.ndarray, " k"]
-    factors: Float[np.ndarray, " k"]
-    offsets: Float[np.ndarray, " k"]
+    factors: VectorK
+    offsets: VectorK
 
 
 @cache
@@ -91,19 +92,19 @@ def list_curves(measured: int) -> Curves:
 class ClosedLoop:
     """A closed loop from (noise, reference) to (measured force, motor force), balanced; or of `list_curves`."""
 
-    a: Float[np.ndarray, "n n"]  # a, b, c, d: shapes (n, n), (n, i), (o, n) and (o, i)
+    a: MatrixNN  # a, b, c, d: shapes (n, n), (n, i), (o, n) and (o, i)
     b: Float[np.ndarray, "n i"]
     c: Float[np.ndarray, "o n"]
     d: Float[np.ndarray, "o i"]
     resolvent: Resolvent  # of `a`, `b` and `c`
-    opened: Complex[np.ndarray, " n"]  # the poles of plant and law, which are the zeros of S
+    opened: ComplexN  # the poles of plant and law, which are the zeros of S
     # the matrices of plant and law whose eigenvalues those are, but for the law's integrators
     blocks: tuple[Float[np.ndarray, "np np"], Float[np.ndarray, "nk nk"]]
     table: Curves  # its curves
-    through: Float[np.ndarray, " k"]  # their direct terms
+    through: VectorK  # their direct terms
 
     @property
-    def poles(self) -> Complex[np.ndarray, " n"]:
+    def poles(self) -> ComplexN:
         """The eigenvalues of `a`."""
         return self.resolvent.poles
 
@@ -111,12 +112,12 @@ class ClosedLoop:
         """Return S, T, S - T, C_y S, F/F_ref and what else is in the table at angles (rad) on the unit circle."""
         return self._combine(self.resolvent.respond(np.exp(1j * theta)))
 
-    def sensitivity(self, theta: Angles) -> Complex[np.ndarray, " m"]:
+    def sensitivity(self, theta: Angles) -> ComplexM:
         """Return S as a product over its zeros and poles: exact where it vanishes, at an integrator."""
         z = np.exp(1j * theta)[:, None]
         return self.d[0, 0] * np.prod((z - self.opened) / (z - self.poles), axis=1)
 
-    def resolution(self) -> Float[np.ndarray, " n"]:
+    def resolution(self) -> VectorN:
         """Return how well each pole of plant and law is known: rounding times its condition, large of a double one. The
         first-order bound of an eigenvalue's error, of the balanced matrix (Golub, Van Loan, Matrix Computations,
         7.2.2).
@@ -167,12 +168,7 @@ class ClosedLoop:
         c, none = self.c[0], np.zeros_like(self.a)
         return self._pencil(self.b[:, 0], (none, c), (c, -1.0, 0.0))
 
-    def _pencil(
-        self,
-        b: Float[np.ndarray, " n"],
-        costate: tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]],
-        last: tuple[Float[np.ndarray, " n"], float, float],
-    ) -> Pencil:
+    def _pencil(self, b: VectorN, costate: tuple[MatrixNN, VectorN], last: tuple[VectorN, float, float]) -> Pencil:
         n = b.size
         m, k = np.zeros((2 * n + 1, 2 * n + 1)), np.zeros((2 * n + 1, 2 * n + 1))
         m[:n, :n], m[:n, -1] = self.a, b
@@ -222,7 +218,7 @@ def close(plant: Block, law: Law) -> ClosedLoop:
     )
 
 
-def _resolution(a: Float[np.ndarray, "n n"]) -> Float[np.ndarray, " n"]:
+def _resolution(a: MatrixNN) -> VectorN:
     """Return the eigenvalues' errors for a backward error of ROUNDINGS, in the order of `numpy.linalg.eigvals`."""
     from scipy.linalg import eig, matrix_balance
 

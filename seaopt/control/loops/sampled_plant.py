@@ -34,6 +34,7 @@ from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import DRIVE_DELAY, dynamics_function, refuse_samples
 from seaopt.records import record
+from seaopt.signals import ComplexM, MatrixNN, VectorM, VectorN
 from seaopt.units import factor
 
 PerPlant = Float[np.ndarray, " k"]
@@ -71,8 +72,8 @@ class DigitalPlant:
         y/u at 0 Hz, from the continuous plant; infinite where it has an integrator.
     """
 
-    a: Float[np.ndarray, "n n"]
-    b: Float[np.ndarray, " n"]
+    a: MatrixNN
+    b: VectorN
     c: Float[np.ndarray, "y n"]
     d: Float[np.ndarray, " y"]
     sample_time_s: float
@@ -84,11 +85,11 @@ class DigitalPlant:
         """Half the sample rate."""
         return 0.5 / self.sample_time_s
 
-    def response(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+    def response(self, f: VectorM) -> ComplexM:
         """Return P(z) z^-delay at frequencies in Hz, of the regulated output."""
         return self.responses(f)[0]
 
-    def responses(self, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "y m"]:
+    def responses(self, f: VectorM) -> Complex[np.ndarray, "y m"]:
         """Return P(z) z^-delay at frequencies in Hz, of every output."""
         z = np.exp(2j * np.pi * f * self.sample_time_s)
         x = np.linalg.solve(z[:, None, None] * np.eye(self.b.size) - self.a, self.b[None, :, None])[..., 0]
@@ -476,9 +477,7 @@ def _exponential(a: Matrices, b: Vectors, t: Inexact[np.ndarray, " k"]) -> tuple
     return out[:, :n, :n], out[:, :n, n]
 
 
-def _compute_static_gain(
-    a: Float[np.ndarray, "n n"], b: Float[np.ndarray, " n"], c: Float[np.ndarray, "y n"], d: Float[np.ndarray, " y"]
-) -> float:
+def _compute_static_gain(a: MatrixNN, b: VectorN, c: Float[np.ndarray, "y n"], d: Float[np.ndarray, " y"]) -> float:
     """Return the first output of a constant unit at rest; infinite where it integrates."""
     with np.errstate(divide="ignore", invalid="ignore"):
         try:

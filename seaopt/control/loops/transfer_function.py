@@ -9,6 +9,7 @@ from jaxtyping import Complex, Float
 
 from seaopt.codec import Constraints
 from seaopt.records import record
+from seaopt.signals import MatrixNN, VectorM, VectorN
 
 Frequencies = Float[np.ndarray, " m"]  # Hz
 Response = Complex[np.ndarray, " m"]  # at these
@@ -19,8 +20,8 @@ POLE_ROUNDING = 1e-17  # least denominator, over the sum of its coefficients
 class TransferFunction:
     """num(q)/den(q): coefficients in ascending powers of q = z^-1, den[0] = 1."""
 
-    num: Annotated[Float[np.ndarray, " n"], Constraints(min_length=1)]
-    den: Annotated[Float[np.ndarray, " m"], Constraints(min_length=1)]
+    num: Annotated[VectorN, Constraints(min_length=1)]
+    den: Annotated[VectorM, Constraints(min_length=1)]
 
     def response(self, f: Frequencies, sample_time_s: float) -> Response:
         """Return the values at frequencies in Hz; next to a pole on the circle, no more than rounding allows."""
@@ -29,7 +30,7 @@ class TransferFunction:
         least = POLE_ROUNDING * np.sum(np.abs(self.den))
         return np.polynomial.polynomial.polyval(q, self.num) / np.where(np.abs(below) < least, least, below)
 
-    def state_space(self) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
+    def state_space(self) -> tuple[MatrixNN, VectorN, VectorN, float]:
         """Return a controllable canonical realisation."""
         n = max(self.num.size, self.den.size) - 1
         num, den = np.zeros(n + 1), np.zeros(n + 1)

@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.records import record
+from seaopt.signals import MatrixMN, MatrixNN, VectorK
 
 Vector = Float[np.ndarray, " n"]
 PerRow = Float[np.ndarray, " m"]
@@ -55,15 +56,15 @@ class _Held:
 
     sides: dict[int, int]  # by row
     point: Vector
-    dual: Float[np.ndarray, " k"]
-    Q: Float[np.ndarray, "n n"]
+    dual: VectorK
+    Q: MatrixNN
     R: Float[np.ndarray, "k k"]
 
 
 @record(eq=False)
 class _Bounds:
     start: Vector
-    normals: Float[np.ndarray, "m n"]
+    normals: MatrixMN
     low: PerRow
     high: PerRow
 
@@ -112,12 +113,7 @@ class _Bounds:
 
 
 def find_nearest(
-    start: Vector,
-    normals: Float[np.ndarray, "m n"],
-    low: PerRow,
-    high: PerRow,
-    sides: Int[np.ndarray, " m"],
-    max_iterations: int,
+    start: Vector, normals: MatrixMN, low: PerRow, high: PerRow, sides: Int[np.ndarray, " m"], max_iterations: int
 ) -> QPSolution:
     """Return the point nearest to `start` within low <= normals x <= high; of a row held at one end the other is not
     looked at. `sides`: where rows are held to begin with, linearly independent, as in a QPSolution. `max_iterations`:

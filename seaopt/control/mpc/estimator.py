@@ -37,6 +37,7 @@ from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.friction import find_dry_friction
 from seaopt.plants.plant import deflection_row
 from seaopt.records import record
+from seaopt.signals import MatrixMN, VectorM
 from seaopt.simulation.discretisation import expm_with_derivatives
 from seaopt.simulation.simulate import input_samples
 
@@ -93,14 +94,14 @@ class EstimatorRun:
         First sample that the test counts.
     """
 
-    time: Float[np.ndarray, " m"]
-    values: Mapping[str, Float[np.ndarray, " m"]]
+    time: VectorM
+    values: Mapping[str, VectorM]
     std: Mapping[str, float]
-    innovations: Mapping[str, Float[np.ndarray, " m"]]
+    innovations: Mapping[str, VectorM]
     whiteness_p: Mapping[str, float]
     settled: int
 
-    def __getitem__(self, name: str) -> Float[np.ndarray, " m"]:
+    def __getitem__(self, name: str) -> VectorM:
         """Return one estimate over the log."""
         if name not in self.values:
             raise ControlError(f'no estimate "{name}"; {suggestion(name, self.values)}')
@@ -423,7 +424,7 @@ def _solve_riccati(
         ) from error
 
 
-def run_recursion(a: Matrix, v: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+def run_recursion(a: Matrix, v: MatrixMN) -> MatrixMN:
     """Return x with x[k] = a x[k-1] + v[k], x[-1] = 0, by doubling the reach until a's power has died out."""
     x, power, reach = v, a, 1
     while reach < len(v) and np.max(np.abs(power)) > 1e-18:

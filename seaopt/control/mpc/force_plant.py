@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.records import record
+from seaopt.signals import MatrixNN, VectorN
 
 State = Float[np.ndarray, " nx"]
 
@@ -30,7 +31,7 @@ class ForcePlant:
         """The state at rest per unit of command."""
         return np.linalg.solve(np.eye(self.b.size) - self.a, self.b + self.late)
 
-    def add_command(self) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
+    def add_command(self) -> tuple[MatrixNN, VectorN]:
         """Return A and b of the plant with its last command as a state, driven by the command's increments."""
         nx = self.b.size
         A = np.eye(nx + 1)
@@ -66,7 +67,7 @@ def spread_knots(samples: int, moves: int) -> Int[np.ndarray, " n"]:
     return np.maximum(knots, np.arange(moves))
 
 
-def _space_knots(factor: float, moves: int) -> Float[np.ndarray, " n"]:
+def _space_knots(factor: float, moves: int) -> VectorN:
     return np.concatenate([[0.0], np.cumsum(factor ** np.arange(moves - 1))])
 
 

@@ -27,6 +27,7 @@ from seaopt.control.mpc.estimator import Estimator
 from seaopt.control.mpc.force_plant import ForcePlant, spread_knots
 from seaopt.errors import ControlError, suggestion
 from seaopt.records import record
+from seaopt.signals import VectorK
 
 BOUND_SAMPLES = 12  # of the horizon at which a bounded signal is held
 SLACK_UNIT = 0.1  # of a slack, in half widths: the solver's tolerance grows with the penalty of one unit
@@ -37,9 +38,9 @@ class OutputBounds:
     """Bounded signals over the horizon, each in units of half the width of its bounds."""
 
     names: tuple[str, ...]  # outputs and states of the plant
-    middle: Float[np.ndarray, " k"]  # middle, half: centre and half width of the bounds, in the signals' units
-    half: Float[np.ndarray, " k"]
-    static: Float[np.ndarray, " k"]  # value at rest per unit of command, over `half`
+    middle: VectorK  # middle, half: centre and half width of the bounds, in the signals' units
+    half: VectorK
+    static: VectorK  # value at rest per unit of command, over `half`
     # from the state's distance to its target, and the last command's, to the signal at m samples, signal by signal
     free: Float[np.ndarray, "km nx1"]
     forced: Float[np.ndarray, "km n"]  # the same of the knots, in units of the limit of the command

@@ -36,6 +36,7 @@ from seaopt.control.mpc.force_plant import ForcePlant, interpolate_knots
 from seaopt.control.mpc.output_bounds import OutputBounds
 from seaopt.errors import ControlError
 from seaopt.records import record
+from seaopt.signals import MatrixMN, MatrixNN, VectorM
 
 WEIGHTS = (1e-9, 1e9)  # of rho, over the square of the current per force
 FASTEST_PLAN = 4.0  # times the bandwidth that is asked behind a prefilter
@@ -49,7 +50,7 @@ class Regulator:
     rho: float  # weight of the current's increments, 1/A^2
     K_x: Float[np.ndarray, " nx"]  # A per unit of each state
     K_u: float
-    Pi: Float[np.ndarray, "n n"]
+    Pi: MatrixNN
 
 
 @record(eq=False)
@@ -60,10 +61,10 @@ class HorizonProgram:
     """
 
     knots: Int[np.ndarray, " n"]  # samples at which the current is free
-    H: Float[np.ndarray, "n n"]
+    H: MatrixNN
     F: Float[np.ndarray, "n s"]
     # slopes between knots over the slew limit, if there is one; the first row is the step from the last current
-    M: Float[np.ndarray, "m n"]
+    M: MatrixMN
     lag_s: float  # with which a force error dies out at no cost
     # of the differences to the last reference known, at as many samples as can be known ahead
     R: Float[np.ndarray, "n p"]
@@ -117,7 +118,7 @@ def tune_regulator(plant: ForcePlant, bandwidth_hz: float) -> Regulator:
     return regulator
 
 
-def _track(plant: ForcePlant, candidate: Regulator, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+def _track(plant: ForcePlant, candidate: Regulator, f: VectorM) -> VectorM:
     """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
     (A, b), row = plant.add_command(), np.append(plant.c, 0.0)
     closed = A - np.outer(b, np.append(candidate.K_x, candidate.K_u))

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from seaopt.control.mpc.active_set import QPSolution, find_nearest
 from seaopt.control.mpc.prediction import HorizonProgram
 from seaopt.records import record
+from seaopt.signals import MatrixMN, MatrixNN, VectorM, VectorN
 
 PENALTY = 3.0  # of a unit of slack, a tenth of half the width of its bounds; the Hessian's diagonal is 1 on the mean
 CURVATURE = 1.0  # of half its square
@@ -33,17 +34,12 @@ def stack_hessian(prediction: HorizonProgram) -> Float[np.ndarray, "nv nv"]:
 class QuadraticProgram:
     """A program's matrices; `factor_program` makes one."""
 
-    inverse: Float[np.ndarray, "n n"]
-    normals: Float[np.ndarray, "m n"]  # the rows of y, of length 1
-    scale: Float[np.ndarray, " m"]  # one over the lengths that they had: of their bounds too
+    inverse: MatrixNN
+    normals: MatrixMN  # the rows of y, of length 1
+    scale: VectorM  # one over the lengths that they had: of their bounds too
 
     def solve(
-        self,
-        q: Float[np.ndarray, " n"],
-        low: Float[np.ndarray, " m"],
-        high: Float[np.ndarray, " m"],
-        sides: Int[np.ndarray, " m"],
-        max_iterations: int,
+        self, q: VectorN, low: VectorM, high: VectorM, sides: Int[np.ndarray, " m"], max_iterations: int
     ) -> QPSolution:
         """Return the solution for a gradient and bounds, from rows that are held to begin with."""
         nearest = find_nearest(
@@ -52,7 +48,7 @@ class QuadraticProgram:
         return replace(nearest, x=self.inverse.T @ nearest.x)
 
 
-def factor_program(hessian: Float[np.ndarray, "n n"], rows: Float[np.ndarray, "m n"]) -> QuadraticProgram:
+def factor_program(hessian: MatrixNN, rows: MatrixMN) -> QuadraticProgram:
     """Return a program by its Hessian and its rows, none of which is zero."""
     inverse = np.linalg.inv(np.linalg.cholesky(hessian))
     normals = rows @ inverse.T

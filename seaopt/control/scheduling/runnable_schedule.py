@@ -30,6 +30,7 @@ from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.step_order import SHARE, StepOrder
 from seaopt.plants.motor.heat_guard import COLD
 from seaopt.records import record
+from seaopt.signals import VectorM, VectorN
 from seaopt.simulation.direct_call import DirectCall
 from seaopt.units import show_command
 
@@ -110,7 +111,7 @@ class RunnableSchedule(Guarded):
     """
 
     table: GainTable
-    anti_windup: Float[np.ndarray, " n"]
+    anti_windup: VectorN
     fallback: float
     terms: Float[np.ndarray, "n c"] | None = None
 
@@ -138,7 +139,7 @@ class RunnableSchedule(Guarded):
         )
 
     @property
-    def numbers(self) -> Float[np.ndarray, " m"]:
+    def numbers(self) -> VectorM:
         """All else, as its shape takes it."""
         rows = np.array([*self.table.columns.values(), self.anti_windup, *([] if self.terms is None else self.terms.T)])
         return np.concatenate([self.table.points, rows.ravel("F")])
@@ -186,7 +187,7 @@ class RunnableSchedule(Guarded):
         """
         run, n, y = _compile_step(self, get_ident()), len(self.table.states), self.measured
 
-        def respond(x: Any, reference: float, read: Any, most: float, added: float) -> Float[np.ndarray, " m"]:
+        def respond(x: Any, reference: float, read: Any, most: float, added: float) -> VectorM:
             effort, _, after = run(place, x, reference, read, most, added)
             return np.concatenate([after[:, 0], effort[0]])
 

@@ -40,6 +40,7 @@ from seaopt.control.tuning.grid import FRICTION, Curve, Grid, Indices, LawRespon
 from seaopt.control.tuning.law_numbers import K_D, K_P, K_V, LawNumbers
 from seaopt.control.tuning.optimisation_problem import CURVES, NEXT_TO_NO_NOISE, PASSIVE, Task
 from seaopt.records import record
+from seaopt.signals import ComplexN, MatrixMN, MatrixNN
 
 PerGain = Float[np.ndarray, " g"]
 ValueSlopes = Float[np.ndarray, "n g"]
@@ -123,7 +124,7 @@ def linearise_law(task: Task, grid: Grid, x: LawNumbers) -> _Affine:
     return _Affine(law=task.respond(grid, x), by_y=by_y, by_r=by_r, by_v=by_v)
 
 
-def _differentiate_size(value: Complex[np.ndarray, " n"], by: Complex[np.ndarray, "g n"]) -> ValueSlopes:
+def _differentiate_size(value: ComplexN, by: Complex[np.ndarray, "g n"]) -> ValueSlopes:
     """Return the derivative of abs(value): the part of `by` along it."""
     size = np.maximum(np.abs(value), 1e-300)
     return np.real(np.conj(value) / size * by).T
@@ -278,9 +279,7 @@ def _solve_step(task: Task, grid: Grid, x: LawNumbers, reach: PerGain) -> PerGai
     return None if answer is None else answer[:n] * reach
 
 
-def solve_qp(
-    quadratic: Float[np.ndarray, "n n"], linear: Values, matrix: Float[np.ndarray, "m n"], lower: Curve, upper: Curve
-) -> Values | None:
+def solve_qp(quadratic: MatrixNN, linear: Values, matrix: MatrixMN, lower: Curve, upper: Curve) -> Values | None:
     """Minimise x'Qx/2 + c'x with lower <= A x <= upper by OSQP; None where it refuses, or its status is no solution."""
     import osqp
 
@@ -307,7 +306,7 @@ def solve_qp(
     return x if usable and np.all(np.isfinite(x)) else None
 
 
-def _make_sparse(matrix: Float[np.ndarray, "m n"]) -> Any:
+def _make_sparse(matrix: MatrixMN) -> Any:
     """Return a small matrix as a sparse one, by columns, in a third of the time that SciPy takes for a dense one."""
     from scipy.sparse import csc_matrix
 

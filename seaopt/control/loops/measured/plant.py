@@ -20,12 +20,13 @@ breaks this, and nothing in the points would show it.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex
 
 from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.errors import ControlError
 from seaopt.frequency.measured import MeasuredResponse
 from seaopt.records import record
+from seaopt.signals import VectorK
 from seaopt.simulation import Clock
 
 WHOLE = 1e-6  # of a sample: a delay or a period that is off by less is exact
@@ -60,7 +61,7 @@ class MeasuredPlant:
         """That assumed at 0 Hz, of the lowest point's size."""
         return float(np.abs(self.centre[0]) * np.sign(np.real(self.centre[0])))
 
-    def response(self, f: Float[np.ndarray, " k"]) -> Complex[np.ndarray, " k"]:
+    def response(self, f: VectorK) -> Complex[np.ndarray, " k"]:
         """Return the centres at any frequencies: zero above the band."""
         out = np.interp(f, self.f, np.real(self.centre)) + 1j * np.interp(f, self.f, np.imag(self.centre))
         below = f < self.f[0]
@@ -69,7 +70,7 @@ class MeasuredPlant:
         out[f > self.f[-1]] = 0.0
         return out
 
-    def discs(self, f: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    def discs(self, f: VectorK) -> VectorK:
         """Return the radii at any frequencies."""
         above = self.end * self.f[-1] / np.maximum(f, self.f[-1]) + self.folded
         return np.where(f > self.f[-1], above, np.interp(f, self.f, self.radius))
