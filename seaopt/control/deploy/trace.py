@@ -21,7 +21,7 @@ class Term(NDArrayOperatorsMixin):
     trace: Trace
     text: str
 
-    def __array_ufunc__(self, ufunc: Any, _method: str, *sides: Any) -> Term:
+    def __array_ufunc__(self, ufunc: Any, _method: str, *sides: Any, **_out: Any) -> Term:  # `out`: of +=
         if ufunc is np.negative:
             return self.trace.keep(f"-{self.text}", [self.text])
         return self.trace.combine(sides[0], SIGNS[ufunc], sides[1])
