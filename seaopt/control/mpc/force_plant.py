@@ -7,8 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.mpc.spec import MPCSpec
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.plant import find_range, name_input
 from seaopt.records import record
 from seaopt.signals import MatrixNN, VectorN
+from seaopt.units import mechanics_of, name_command, show_command
 
 State = Float[np.ndarray, " nx"]
 
@@ -75,3 +82,34 @@ def interpolate_knots(knots: Int[np.ndarray, " n"]) -> Float[np.ndarray, "sample
     """Return W, which draws straight lines between the knots."""
     samples = np.arange(knots[-1] + 1)
     return np.column_stack([np.interp(samples, knots, row) for row in np.eye(knots.size)])
+
+
+def limit_command(spec: MPCSpec, plant: Plant, values: ParameterSet) -> float:
+    """Return the limit of the command: what is asked for, and no more than the plant's actuation takes."""
+    return min(spec.limit_asked or np.inf, find_range(plant, values) or np.inf)
+
+
+def find_static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec, limit: float) -> float:
+    """Return N/A of the measured force, or say why it cannot be controlled so."""
+    unit = plant.outputs[spec.measured]
+    word, source = mechanics_of(unit).word, name_command(*name_input(plant))
+    if np.max(np.abs(np.linalg.eigvals(digital.a))) > 1.0 - 1e-9:
+        raise ControlError(
+            f"{plant.name} does not come to rest by itself, so that no {source} belongs to a {word}; design on the "
+            "stand"
+        )
+    gain = float(digital.c[0] @ np.linalg.solve(np.eye(digital.b.size) - digital.a, digital.b))
+    if abs(gain) < 1e-9:
+        raise ControlError(f"{spec.measured} of {plant.name} does not follow a constant {source}; design on the stand")
+    if digital.d[0] != 0.0:
+        raise ControlError(
+            f"{spec.measured} of {plant.name} follows the {source} at once (d = {digital.d[0]:.3g}); "
+            f"control the spring's {word}"
+        )
+    largest = abs(gain) * limit
+    if spec.largest_force_N is not None and spec.largest_force_N > largest:
+        raise ControlError(
+            f"a limit of {show_command(limit, *name_input(plant))} holds {largest:.4g} {unit}, less than "
+            f"largest_force_N = {spec.largest_force_N:g}; raise the one or lower the other"
+        )
+    return gain

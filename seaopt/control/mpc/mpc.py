@@ -42,10 +42,10 @@ from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.loops.sampled_plant import DELAYS, DigitalPlant, find_delay, find_rows, read_conditions, sample
+from seaopt.control.loops.sampled_plant import DELAYS, find_delay, find_rows, read_conditions, sample
 from seaopt.control.mpc.active_set import SOLVED, UNFINISHED
 from seaopt.control.mpc.estimator import Estimator, EstimatorState, estimator
-from seaopt.control.mpc.force_plant import ForcePlant, interpolate_knots, spread_knots
+from seaopt.control.mpc.force_plant import ForcePlant, find_static_gain, interpolate_knots, limit_command, spread_knots
 from seaopt.control.mpc.noise import NoiseModel
 from seaopt.control.mpc.output_bounds import SLACK_UNIT, bound_outputs
 from seaopt.control.mpc.prediction import HorizonProgram, Regulator, condense, find_plan_bandwidth, tune_regulator
@@ -58,7 +58,7 @@ from seaopt.control.mpc.quadratic_program import (
     stack_hessian,
 )
 from seaopt.control.mpc.spec import MPCSpec
-from seaopt.control.mpc.step import MPCState, MPCStep, shape_references
+from seaopt.control.mpc.step import MPCState, MPCStep, read_references, shape_references
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
@@ -68,9 +68,9 @@ from seaopt.plants.friction import split_friction, take_sliding
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import freeze_heat, rate_motor
-from seaopt.plants.plant import find_range, name_input, require_plant
+from seaopt.plants.plant import name_input, require_plant
 from seaopt.records import Result, Worded, record
-from seaopt.units import mechanics_of, name_command, show_command, unit_after
+from seaopt.units import unit_after
 
 References = Float[np.ndarray, " r"]
 State = Float[np.ndarray, " n"]  # z of the filter
@@ -292,7 +292,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
             A reference is not a finite number within +-1e15, or there are more of them than the specification says.
         """
         began = time.perf_counter()
-        references, shaped = self._read_references(reference_N), state.shaped
+        references, shaped = read_references(reference_N, self.spec.preview_samples), state.shaped
         if self.spec.low_pass is not None:
             references, shaped = shape_references(self.spec.low_pass, shaped, references)
         limit, last, seen = self.command_limit, state.current_A, state.gate
@@ -373,18 +373,6 @@ class ForceMPC(ClosesLoops, Result, Worded):
         low = np.concatenate([(-most_A / limit - u_s / limit) * ones, slopes - 1.0, under])
         high = np.concatenate([(most_A / limit - u_s / limit) * ones, slopes + 1.0, over])
         return q, low, high
-
-    def _read_references(self, references_N: float | References) -> Float[np.ndarray, " p"]:
-        """Return the references of this sample and of all that may be known, the last held."""
-        references, count = np.atleast_1d(np.asarray(references_N, dtype=float)), 1 + self.spec.preview_samples
-        if not (references.ndim == 1 and 1 <= references.size <= count):
-            raise ControlError(
-                f"reference_N has the shape {references.shape}, and preview_samples = {count - 1} takes up to {count}; "
-                f"give preview_samples = {references.size - 1} in the specification"
-            )
-        if not all(map(is_number, references)):
-            raise ControlError(f"reference_N = {references_N}: not a force; hold the last one instead")
-        return np.concatenate([references, np.full(count - references.size, references[-1])])
 
     def _observe(self, kalman: EstimatorState, measurement: float) -> tuple[State, Float[np.ndarray, " 1"], State]:
         """Return z with the measurement, the innovation, and z when a current commanded now arrives."""
@@ -553,7 +541,7 @@ def _design(
     completed = plant.complete(ParameterSet(parameter for name, parameter in values.items() if name not in DELAYS))
     digital = sample(plant, completed, spec.measured, 1.0, spec.sample_time_s, 0)
     limit = limit_command(spec, plant, completed)
-    gain = _static_gain(plant, digital, spec, limit)
+    gain = find_static_gain(plant, digital, spec, limit)
     drive = next(iter(plant.inputs))
     noise = spec.noise or NoiseModel(
         sensor_std={spec.measured: SENSOR * abs(gain)}, input_noise={drive: 1.0}, input_drift={drive: 3.0}
@@ -610,34 +598,3 @@ def _design(
         outer=outer,
         warnings=warnings,
     )
-
-
-def limit_command(spec: MPCSpec, plant: Plant, values: ParameterSet) -> float:
-    """Return the limit of the command: what is asked for, and no more than the plant's actuation takes."""
-    return min(spec.limit_asked or np.inf, find_range(plant, values) or np.inf)
-
-
-def _static_gain(plant: Plant, digital: DigitalPlant, spec: MPCSpec, limit: float) -> float:
-    """Return N/A of the measured force, or say why it cannot be controlled so."""
-    unit = plant.outputs[spec.measured]
-    word, source = mechanics_of(unit).word, name_command(*name_input(plant))
-    if np.max(np.abs(np.linalg.eigvals(digital.a))) > 1.0 - 1e-9:
-        raise ControlError(
-            f"{plant.name} does not come to rest by itself, so that no {source} belongs to a {word}; design on the "
-            "stand"
-        )
-    gain = float(digital.c[0] @ np.linalg.solve(np.eye(digital.b.size) - digital.a, digital.b))
-    if abs(gain) < 1e-9:
-        raise ControlError(f"{spec.measured} of {plant.name} does not follow a constant {source}; design on the stand")
-    if digital.d[0] != 0.0:
-        raise ControlError(
-            f"{spec.measured} of {plant.name} follows the {source} at once (d = {digital.d[0]:.3g}); "
-            f"control the spring's {word}"
-        )
-    largest = abs(gain) * limit
-    if spec.largest_force_N is not None and spec.largest_force_N > largest:
-        raise ControlError(
-            f"a limit of {show_command(limit, *name_input(plant))} holds {largest:.4g} {unit}, less than "
-            f"largest_force_N = {spec.largest_force_N:g}; raise the one or lower the other"
-        )
-    return gain

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from seaopt.control.laws.plausibility import GateState
+from seaopt.control.laws.plausibility import GateState, is_number
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import EstimatorState
+from seaopt.errors import ControlError
 from seaopt.plants.motor.heat_guard import COLD
 from seaopt.records import record
 
@@ -94,3 +95,18 @@ def shape_references(
         shaped[k] = out = first * reference + state[0]
         states.append(tuple(b * reference - a * out + s for b, a, s in zip(num, den, (*state[1:], 0.0), strict=True)))
     return shaped, states[1]
+
+
+def read_references(given: float | Float[np.ndarray, " r"], preview_samples: int) -> Float[np.ndarray, " p"]:
+    """Return the references of this sample and of all that may be known, the last held. Raises ControlError: they are
+    more than that, or one is not finite.
+    """
+    references, count = np.atleast_1d(np.asarray(given, dtype=float)), 1 + preview_samples
+    if not (references.ndim == 1 and 1 <= references.size <= count):
+        raise ControlError(
+            f"reference_N has the shape {references.shape}, and preview_samples = {preview_samples} takes up to "
+            f"{count}; give preview_samples = {references.size - 1} in the specification"
+        )
+    if not all(map(is_number, references)):
+        raise ControlError(f"reference_N = {given}: not a force; hold the last one instead")
+    return np.concatenate([references, np.full(count - references.size, references[-1])])
