@@ -230,10 +230,7 @@ def _form_terms(at: LoopResponses, weight: AtAliases) -> TermsOf:
     right = np.stack([weight[..., None] * at.command, at.sensed], axis=-1)
 
     def form(inverse: float, angles: Places) -> Terms:
-        block = weight[angles, :, None, None] * (at.mobility[angles] + inverse * np.eye(at.mobility.shape[-1]))
-        block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
-        positive = np.all(np.linalg.eigvalsh(block) > 0.0, axis=(-2, -1))
-        block = np.where(positive[:, None, None, None], block, np.eye(block.shape[-1]))
+        positive, block = _form_blocks(weight[angles], at.mobility[angles], inverse)
         sums = np.conj(np.swapaxes(right[angles], -1, -2)) @ np.linalg.solve(block, right[angles])
         return positive, np.real(sums[..., 0, 0]), np.real(sums[..., 1, 1]), sums[..., 1, 0]
 
@@ -390,10 +387,14 @@ def limit_feedback(loop: FrictionLoop, theta: Angles, multiplier: str, factor: f
 
 def invert_mobility(weight: AtAliases, mobility: Mobility, inverse: float) -> tuple[Bool[np.ndarray, " m"], Mobility]:
     """Return where all D_k are positive definite at a 1/kappa, and their inverses; the identity where not."""
+    possible, block = _form_blocks(weight, mobility, inverse)
+    return possible, 1.0 / block if block.shape[-1] == 1 else np.linalg.inv(block)
+
+
+def _form_blocks(weight: AtAliases, mobility: Mobility, inverse: float) -> tuple[Bool[np.ndarray, " m"], Mobility]:
+    """Return where all D_k are positive definite at a 1/kappa, and these; the identity where not."""
     block = weight[..., None, None] * (mobility + inverse * np.eye(mobility.shape[-1]))
     block = 0.5 * (block + np.conj(np.swapaxes(block, -1, -2)))
-    if block.shape[-1] == 1:  # numbers, of which LAPACK is slow
-        possible = np.all(block[..., 0, 0].real > 0.0, axis=1)
-        return possible, 1.0 / np.where(possible[:, None, None, None], block, 1.0)
-    possible = np.all(np.linalg.eigvalsh(block) > 0.0, axis=(-2, -1))
-    return possible, np.linalg.inv(np.where(possible[:, None, None, None], block, np.eye(block.shape[-1])))
+    least = block[..., 0].real if block.shape[-1] == 1 else np.linalg.eigvalsh(block)  # of numbers LAPACK is slow
+    possible = np.all(least > 0.0, axis=(-2, -1))
+    return possible, np.where(possible[:, None, None, None], block, np.eye(block.shape[-1]))

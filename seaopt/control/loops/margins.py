@@ -22,7 +22,7 @@ from dataclasses import field
 
 import numpy as np
 
-from seaopt.control.loops.crossings import add_minima
+from seaopt.control.loops.crossings import add_minima, count_turns
 from seaopt.control.loops.loop import GRID_LOWEST_HZ, GROWING, STABLE, Loop
 from seaopt.control.loops.peaks import find_extremes
 from seaopt.errors import ControlError
@@ -186,15 +186,8 @@ def nu_gap(first: Loop, second: Loop) -> tuple[float, float | None]:
     loops = (first, second)
     laws = [loop.about(loop.law.poles) for loop in loops]
     f = np.unique(np.concatenate([_low_frequencies(loops), *(loop.grid() for loop in loops), *laws]))
-    turns = np.zeros(0)
-    for _ in range(40):
-        distance = 1.0 + np.conj(second.open_loop(f)) * first.open_loop(f)
-        turns = np.angle(distance[1:] / distance[:-1])
-        wide = np.flatnonzero(np.abs(turns) > np.pi / 2)
-        if not wide.size or np.min(np.diff(f)[wide] / f[wide]) < 1e-12:
-            break
-        f = np.sort(np.concatenate([f, 0.5 * (f[wide] + f[wide + 1])]))
-    half_turns = round(2.0 * float(np.sum(turns)) / np.pi)
+    turn, f = count_turns(lambda x: 1.0 + np.conj(second.open_loop(x)) * first.open_loop(x), f, np.pi / 2, 40)
+    half_turns = round(2.0 * turn / np.pi)
     outside = [int(np.sum(np.abs(np.linalg.eigvals(loop.plant.a)) > GROWING)) for loop in loops]
     integrators = [_count_integrators(loop) for loop in loops]
     if half_turns != 2 * (outside[0] - outside[1]) + integrators[0] - integrators[1]:

@@ -407,8 +407,8 @@ def _solve_riccati(
     from scipy.linalg import solve_discrete_are  # deferred: scipy is slow to load
 
     poles, modes = np.linalg.eig(A)
-    seen = np.linalg.norm((C / np.sqrt(np.diag(R))[:, None]) @ modes, axis=0)
-    size = np.linalg.norm(np.abs(C / np.sqrt(np.diag(R))[:, None]) @ np.abs(modes), axis=0) + 1e-300
+    read = C / np.sqrt(np.diag(R))[:, None]
+    seen, size = np.linalg.norm(read @ modes, axis=0), np.linalg.norm(np.abs(read) @ np.abs(modes), axis=0) + 1e-300
     for k in np.flatnonzero((np.abs(poles) > 1.0 - 1e-9) & (seen <= 1e-9 * size)):
         states = [*plant.states, *["a disturbance"] * len(A)]
         name = states[int(np.argmax(np.abs(modes[:, k])))]

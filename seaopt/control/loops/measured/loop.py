@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.codec import OrInfinite, OrNaN
-from seaopt.control.loops.crossings import find_crossings
+from seaopt.control.loops.crossings import count_turns, find_crossings
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import DROOP_BAND, FALLEN_ABOVE, GRID_LOWEST_HZ, SHOULDER, SHOULDER_FALL, LoopFigures
 from seaopt.control.loops.measured.plant import ASSUMED, MeasuredPlant
@@ -83,15 +83,9 @@ class DiscLoop:
             return False
         if np.any(np.abs(self.law.poles[self.law.integrators :]) >= 1.0):
             return False  # a law that grows by itself is not counted here
-        f, turns = np.concatenate([[SLOWEST_HZ], f]), np.zeros(0)
-        for _ in range(REFINEMENTS + 1):
-            distance = 1.0 + self.open_loop(f)
-            turns = np.angle(distance[1:] / distance[:-1])
-            wide = np.flatnonzero(np.abs(turns) > MOST_TURN_RAD)
-            if not wide.size:
-                break
-            f = np.sort(np.concatenate([f, 0.5 * (f[wide] + f[wide + 1])]))
-        return abs(float(np.sum(turns)) / (0.5 * np.pi) - self.law.integrators) < ROUND
+        f = np.concatenate([[SLOWEST_HZ], f])
+        turn, _ = count_turns(lambda x: 1.0 + self.open_loop(x), f, MOST_TURN_RAD, REFINEMENTS + 1)
+        return abs(turn / (0.5 * np.pi) - self.law.integrators) < ROUND
 
     def figures(self, asked_hz: float | None = None) -> LoopFigures:
         r"""Return the worst figures of all responses in the discs; of a loop that is not shown to be stable, none. The
