@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +23,9 @@ from seaopt.control.laws.stored import (
 )
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Prefilter, SpeedLoop
 from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_figures, shorten_blocked
-from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
+from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath, multiply_out
 from seaopt.control.loops.compensation.terms import Compensation
-from seaopt.control.loops.friction_loop import FrictionLoop, make_friction_loops
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.loop import DiscLoop, MeasuredFigures
@@ -500,6 +499,8 @@ class Controller(ClosesLoops, Result, Worded):
             command = replace(command, largest=find_range(plant, params), measured_unit=unit)
             design = plant, controller.delay(params)
             controller = replace(controller, command=command, design=design)
+            from seaopt.control.laws.friction_margin import find_friction_margin  # deferred: it knows controllers
+
             figures, friction = controller.close(*design).figures(), find_friction_margin(controller, *design)
             controller = replace(controller, achieved=figures, friction=friction)
         check_achieved(content.get("achieved"), _list_achieved(controller.achieved))
@@ -520,30 +521,6 @@ class Controller(ClosesLoops, Result, Worded):
         _, *sticking = split_friction({"": plant}, params).items()
         stuck = {name: Loop(plant=self.plant(model, params), law=self.law).figures() for name, model in sticking}
         return {" sliding" if stuck else "": self.achieved} | stuck
-
-
-def find_friction_margin(controller: ClosesLoops, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
-    """Return how much steeper friction may be with stability shown, between the samples too; None without friction. The
-    linear plant is the sliding one; what a curve's slope is above its flattest is in the sector. The controller's
-    measurement path closes the loop; the reference stands still; `params` may hold conditions. The factor is zero where
-    the sliding loop is unstable, has an `obstacle` (`FrictionLoop`), or nothing was shown, which does not show an
-    oscillation.
-    """
-    return find_friction_margins(controller, plant, [params])[0]
-
-
-def find_friction_margins(
-    controller: ClosesLoops, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
-) -> list[FrictionMargin | None]:
-    """Return `find_friction_margin` at sets of parameters with the same conditions; see `friction_margin`."""
-    loops = take_friction_out(controller, plant, sets)
-    return [None if loop is None else friction_margin(loop, first, least) for loop in loops]
-
-
-def take_friction_out(controller: ClosesLoops, plant: Plant, sets: Sequence[ParameterSet]) -> list[FrictionLoop | None]:
-    """Return `make_friction_loops` of a controller."""
-    late, waits = [controller.delay(params) for params in sets], controller.compute_delay_samples
-    return make_friction_loops(plant, late, controller.signals, controller.per_effort, waits, controller.law)
 
 
 def _list_achieved(figures: LoopFigures) -> dict[str, Any]:

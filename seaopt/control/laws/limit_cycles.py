@@ -20,7 +20,8 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Complex
 
-from seaopt.control.laws.controller import Controller, take_friction_out
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.friction_margin import take_friction_out
 from seaopt.control.loops.crossings import find_crossings
 from seaopt.control.loops.friction_loop import FUNDAMENTAL, FrictionLoop
 from seaopt.control.loops.transfer_function import Frequencies, Response

@@ -20,8 +20,9 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.control.laws.command import command_of
-from seaopt.control.laws.controller import Controller, find_friction_margin
+from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import place_drive_delay, settle_delays, take_own_delays
+from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CASCADE, CUSTOM, DisturbanceObserver, Nominal, SpeedLoop

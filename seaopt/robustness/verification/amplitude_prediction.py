@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control import Controller
-from seaopt.control.laws.controller import take_friction_out
+from seaopt.control.laws.friction_margin import take_friction_out
 from seaopt.control.laws.limit_cycles import AMPLITUDES, describe_friction
 from seaopt.control.loops.friction_loop import FUNDAMENTAL
 from seaopt.parameters import ParameterSet

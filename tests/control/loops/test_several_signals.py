@@ -17,7 +17,8 @@ from seaopt.control import Law, assess, cascade_pid, parallel_pid, passivity, re
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.sampled_port import SampledPort
-from seaopt.control.laws.controller import Controller, find_friction_margin
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.friction_margin import find_friction_margin
 from seaopt.control.laws.limit_cycles import predict_limit_cycles
 from seaopt.control.loops.sampled_plant import find_signals
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
