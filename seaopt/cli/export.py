@@ -18,7 +18,8 @@ from seaopt.control.deploy.target import Tare
 from seaopt.control.laws.plausibility import Agreement, GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
 from seaopt.control.laws.verdict import join_labels
-from seaopt.control.mpc.export import SOURCES, read_code, set_gate, set_heat, write_code
+from seaopt.control.mpc.export import SOURCES, set_gate, set_heat, write_code
+from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ControlError, ProblemError
 from seaopt.files import exists, read_json, to_json
 from seaopt.plants.motor.heat_guard import HeatGuard

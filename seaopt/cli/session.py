@@ -23,7 +23,7 @@ from seaopt.control.frontier.frontier import FRONTIER_SCHEMA
 from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, warn_delays
 from seaopt.control.laws.stored import CONTROLLER_SCHEMA
 from seaopt.control.laws.structures import CUSTOM
-from seaopt.control.mpc.export import describe_mpc
+from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError
 from seaopt.estimation import Experiment, Fit, compare_with_log, warn_unidentified
 from seaopt.estimation.fit import SCALED

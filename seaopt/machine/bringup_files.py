@@ -9,7 +9,7 @@ import numpy as np
 
 from seaopt.control import ForceMPC, export, export_mpc
 from seaopt.control.deploy.target import LOG_ROWS, Tare
-from seaopt.control.mpc.export import describe_mpc
+from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
 from seaopt.machine.bringup import Band, BringUp, Stage

@@ -34,7 +34,7 @@ from seaopt.control import (
 from seaopt.control.laws.delay import DELAY_KEYS, NEGLIGIBLE, LoopSpec, find_drive_delay, settle_delays
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.control.loops.sampled_plant import list_names
-from seaopt.control.mpc.export import check_described
+from seaopt.control.mpc.stored import check_described
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
 from seaopt.errors import ControlError, ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit

@@ -11,7 +11,7 @@ import seaopt as so
 from seaopt.cli.export import _list_typed
 from seaopt.codec import to_content
 from seaopt.control import MPCSpec, PlausibilityGate, force_mpc
-from seaopt.control.mpc.export import describe_mpc
+from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import Prefilter, export_mpc
-from seaopt.control.mpc.export import check_described, describe_mpc
+from seaopt.control.mpc.stored import check_described, describe_mpc
 from seaopt.files import to_json
 from seaopt.problem.stages import certify_problem, check_mpc_file, design_mpc, tune_problem
 

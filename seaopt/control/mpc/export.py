@@ -1,9 +1,9 @@
-"""The C code of a `ForceMPC`: the numbers of one controller, what runs it, which is the same for all, and its file."""
+"""The C code of a `ForceMPC`: the numbers of one controller, and what runs it, which is the same for all."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,22 +11,19 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.codec import Constraints, from_content, to_content
+from seaopt.codec import Constraints, to_content
 from seaopt.control.laws.plausibility import PlausibilityGate
-from seaopt.control.laws.structures import AGREES
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
 from seaopt.control.mpc.quadratic_program import PENALTY, WIDE, factor_program, stack_hessian
-from seaopt.errors import FileError
 from seaopt.files import plain, write_text
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.records import record
 
 CName = Annotated[str, Constraints(pattern=r"^[A-Za-z_]+$")]
 CText = Annotated[str, Constraints(pattern=r'^[^"\\\r\n]*$')]  # stands between quotation marks in C
-TUNE_AGAIN = "run seaopt tune again"
 SOURCES = ("force_mpc.h", "force_mpc.c", "active_set.h", "active_set.c", "arithmetic.h", "example.c")
 
 
@@ -208,44 +205,3 @@ def _format_array(name: str, value: Float[np.ndarray, "..."]) -> str:
     else:
         body = ",\n ".join("{" + ", ".join(map(_format_number, line)) + "}" for line in value)
     return f"static const force_mpc_real mpc_{name}{shape} = {{{body}}};"
-
-
-def describe_mpc(mpc: ForceMPC) -> dict[str, Any]:
-    """Return what controller.json says of a plan beside its linear law: its specification, and its C code's numbers."""
-    return {"spec": asdict(mpc.spec), "code": collect_code(mpc).to_dict()}
-
-
-def check_described(content: Any, mpc: ForceMPC, *, source: str, problem: str, remedy: str) -> None:
-    """Refuse (FileError) a controller.json's `mpc` that does not describe (`describe_mpc`) the controller: another
-    specification, numbers of the C code that other parameters make, or malformed ones.
-    """
-    stored, expected = plain(content), plain(describe_mpc(mpc))
-    spec = stored.get("spec") if isinstance(stored, dict) else None
-    if not isinstance(spec, dict):
-        raise FileError(f"{source}: mpc has no spec; {remedy}")
-    for name, wanted in expected["spec"].items():
-        if spec.get(name) != wanted:
-            raise FileError(
-                f"{source}: mpc.spec.{name} is {spec.get(name)}, and {problem} asks for {wanted}; correct one of them, "
-                f"or {remedy}"
-            )
-    if not _is_same(read_code(stored.get("code")).to_dict(), expected["code"]):
-        raise FileError(
-            f"{source}: mpc.code is not what {problem} makes of this specification: its parameters, or its fit, are "
-            f"others; {remedy}"
-        )
-
-
-def _is_same(stored: Any, expected: Any) -> bool:
-    """Tell whether numbers of C code are the same but for the rounding of another machine."""
-    if isinstance(expected, Mapping):
-        return stored.keys() == expected.keys() and all(_is_same(stored[name], expected[name]) for name in expected)
-    if expected is None or isinstance(expected, str):
-        return stored == expected
-    a, b = np.array(stored, dtype=float), np.array(expected, dtype=float)
-    return a.shape == b.shape and bool(np.all(np.abs(a - b) <= AGREES * np.max(np.abs(b), initial=0.0)))
-
-
-def read_code(content: Any) -> MPCCode:
-    """Return the numbers of a controller.json's C code. Raises FileError: a field is missing or malformed."""
-    return from_content(MPCCode, content, "controller.json: mpc.code", remedy=TUNE_AGAIN)

@@ -11,7 +11,8 @@ import pytest
 import seaopt as so
 from seaopt.control import MPCSpec, PlausibilityGate, export_mpc, force_mpc
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.mpc.export import collect_code, read_code
+from seaopt.control.mpc.export import collect_code
+from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from tests.c_code import STRICT, CompiledMPC
