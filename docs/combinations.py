@@ -1,4 +1,6 @@
-"""Write docs/reference/combinations.md: which parts go together, each tried: `python docs/combinations.py`."""
+"""Write docs/reference/combinations.md: which parts go together, each tuned, certified, simulated and exported in one
+run: `python docs/combinations.py`.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,11 @@ from tempfile import TemporaryDirectory
 from typer.testing import CliRunner
 
 from seaopt.cli.main import app
-from seaopt.control import read_law
-from seaopt.errors import SeaoptError
-from seaopt.problem import read_problem
+from seaopt.control import export, export_mpc, read_law
+from seaopt.errors import ControlError, SeaoptError
+from seaopt.problem import Problem, read_problem
 from seaopt.problem.stages import assess_problem, certify_problem, design_mpc, tune_problem
+from seaopt.robustness import JointTuning, linear_controller
 
 PAGE = Path(__file__).resolve().parent / "reference" / "combinations.md"
 FILE = """
@@ -55,6 +58,7 @@ TABLES
 [robustness]
 plants = [CERTIFIED]
 samples = 6
+constrained_runs = 1
 ROBUSTNESS
 """
 LIMITS = "bandwidth_hz = 16\nmax_sensitivity = 1.7\nmax_noise_gain = 60\nrobust_to = [ROBUST_TO]"
@@ -66,7 +70,7 @@ virtual = { seed = 1, duration_s = 40, rate_hz = 1000, noise_std = { tau_s = 0.0
 """
 OWN = {  # a PI at 1 kHz
     "sample_time_s": 1e-3, "compute_delay_samples": 1,
-    "reference": {"num": [1.02, -0.98], "den": [1.0, -1.0]}, "measurement": {"num": [0.52, -0.48], "den": [1.0, -1.0]},
+    "reference": {"num": [1.004, -0.996], "den": [1.0, -1.0]}, "measurement": {"num": [0.504, -0.496], "den": [1.0, -1.0]},
 }  # fmt: skip
 BOTH = '["tau_s", "thetad_m"]'
 LAWS: Mapping[str, Mapping[str, str]] = {
@@ -89,8 +93,8 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "`link_feedforward`": {"CONTROLLER": "link_feedforward = true", "ROBUST_TO": '"swing"'},
     "friction, from the reference": {"CONTROLLER": "compensate = { friction = { fraction = 0.4 } }", "COULOMB": "0.002"},
     "friction, from the speed": {"CONTROLLER": 'compensate = { friction = { fraction = 0.4, from = "speed" } }', "COULOMB": "0.002"},
-    "weight of the link": {"CONTROLLER": 'compensate = { gravity = { plant = "swing", fraction = 0.8 } }'},
-    "`[impedance]`": {"TABLES": '[impedance]\nplant = "swing"\nstiffness = 30\ndamping = "critical"'},
+    "weight of the link": {"CONTROLLER": 'compensate = { gravity = { plant = "swing", fraction = 0.8 } }', "CERTIFIED": '"swing"'},
+    "`[impedance]`": {"TABLES": '[impedance]\nplant = "swing"\nstiffness = 30\ndamping = 2.0'},
     "`[controller.gate]`": {"TABLES": "[controller.gate]\nrange_N = [-300, 300]"},
     "`derate`": {"CONTROLLER": "derate = true", "PARTS": 'parts = ["thermal"]'},
     "`frf:` in `robust_to`": {"ROBUST_TO": '"frf:chirp"', "EXPERIMENT": EXPERIMENT},
@@ -101,9 +105,11 @@ PARTS: Mapping[str, Mapping[str, str]] = {
 DEFAULTS = {"PLANT": "stand", "MEASURED": '"tau_s"', "ROBUST_TO": "", "CERTIFIED": '"stand"', "COULOMB": "0", "ROBUSTNESS": "retune = 0"}
 HEAD = """# What goes with what
 
-Each law with each part, tried as a problem file by `python docs/combinations.py`, which writes this page; a slow test runs it again. A part works where the cell has a tick: it is tuned (of a law of
-your own measured) with the part. A number is the reason for which it is refused, below.
-Of a law of your own, notch, prefilter and link feedforward of `[controller]` are not used: the law is what it is.
+Each law with each part, tried as a problem file by `python docs/combinations.py`, which writes this page from one run. A part works where the cell has a tick: with it the law is tuned (one of your
+own measured), certified, with steps of several sizes simulated on its models, and exported as C. Whether the certificate is met is another question: limits, draws and plants decide it. A number is
+the reason for which it is refused, below. A test refuses again what is refused here, and a slow one runs all of it.
+Of a law of your own, notch, prefilter and link feedforward of `[controller]` are not used: the law is what it is. A law that was designed on `frf:` has no model, on which it could be simulated, but
+with plants to certify on. A sweep is run, and nothing of it exported. The impedance has a number for its damping: `"critical"` is refused where something of the loop swings more slowly than the link.
 
 """
 
@@ -126,22 +132,34 @@ def try_combination(law: str, part: str, folder: Path) -> str:
             return tell(str(done.exception), folder)
         return tell(done.stderr, folder) if done.exit_code == 2 else ""
     try:
-        problem = read_problem(path)
-        source = problem.parameters
-        if "own" in law:
-            if "sweep" in part or "retune" in part:
-                return "a law of your own is given: nothing of it is tuned"
-            (folder / "own.json").write_text(json.dumps(OWN))
-            assess_problem(problem, read_law(folder / "own.json"), source)
-        elif problem.mpc is not None:
-            design_mpc(problem, source)
-        else:
-            tuned = tune_problem(problem, source)
-            if problem.designs_on_response and "plants" in part:
-                certify_problem(problem, tuned, source)
+        run_stages(read_problem(path), law, part, folder)
     except SeaoptError as error:
         return tell(str(error), folder)
     return ""
+
+
+def run_stages(problem: Problem, law: str, part: str, folder: Path) -> None:
+    """Tune, certify, simulate and export a combination."""
+    source, subject = problem.parameters, None
+    if "own" in law:
+        if "sweep" in part or "retune" in part:
+            raise ControlError("a law of your own is given: nothing of it is tuned")
+        (folder / "own.json").write_text(json.dumps(OWN))
+        controller = assess_problem(problem, read_law(folder / "own.json"), source)
+    elif problem.mpc is not None:
+        subject = design_mpc(problem, source)
+        controller = linear_controller(subject)
+    else:
+        tuned = tune_problem(problem, source)
+        controller = tuned.controller if isinstance(tuned, JointTuning) else tuned
+    certificate = certify_problem(problem, controller, source, simulations=False)
+    for place in certificate.places or (certificate,):
+        if place.models and isinstance(place.steps, str):  # why none could be simulated
+            raise ControlError(place.steps)
+    if subject is not None:
+        export_mpc(subject, folder / "c")
+    else:
+        export(controller, folder / "c", allow_infeasible=True)
 
 
 def tell(text: str, folder: Path) -> str:

@@ -445,6 +445,7 @@ def certify_problem(
     source: Fit | ParameterSet,
     progress: Progress = ignore,
     executor: Executor | None = None,
+    simulations: bool = True,
 ) -> Certificate:
     """Certify a controller or schedule on the problem's plants, simulations included, as `seaopt certify` does.
 
@@ -456,8 +457,8 @@ def certify_problem(
         The law, which knows its design plant.
     source : Fit or ParameterSet
         The fit; or values, of a problem without experiments.
-    progress, executor
-        As in `seaopt.certify`.
+    progress, executor, simulations
+        As in `seaopt.certify`; without all simulations sensors and rounding are not simulated.
     """
     table, plants, measured = problem.robustness, problem.certified_plants(), problem.measure_responses(source)
     source, unread_logs = _add_logs(problem, source)
@@ -483,8 +484,9 @@ def certify_problem(
         runs=table.constrained_runs,
         bound_tolerance=table.bound_tolerance,
         bounds=Budget() if table.bounds else None,
-        sensors=problem.sensors.of(read),  # the file may name those of its other laws
-        command_step=table.step,
+        simulations=simulations,
+        sensors=problem.sensors.of(read) if simulations else None,  # the file may name those of its other laws
+        command_step=table.step if simulations else 0.0,
         measured=measured,
         executor=executor,
         progress=progress,
