@@ -285,12 +285,14 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=60.0, help="processor time of a fit, s")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--exact", action="store_true", help="nothing is missing from any model")
-    parser.add_argument("--smooth", action="store_true", help="no dry friction, and none is fitted")
+    parser.add_argument("--smooth", action="store_true", help="with --exact: no dry friction, and none is fitted")
     parser.add_argument("--logs", type=int, default=1, choices=(1, 2), help="2: a second one at half the amplitude")
     parser.add_argument("--locked", action="store_true", help="links held: no pendulums, whose fits take long")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--read", type=Path, nargs="*", help="print the table of kept cases, and run none")
     options = parser.parse_args()
+    if options.smooth and not options.exact:
+        parser.error("--smooth needs --exact: several effects are of dry friction")
     if options.read:
         kept = [row for file in options.read for row in json.loads(file.read_text())]
         print("\n".join(summarise(kept)))

@@ -134,12 +134,11 @@ def amplitude_density(values: VectorN, period: float) -> tuple[VectorM, VectorM]
             f"a run of {run.size} samples without a gap is too short for a spectrum; choose a longer stretch with "
             "slice_s"
         )
-    length = min(max(run.size // SPECTRUM_STRETCHES, FEWEST_SAMPLES), LONGEST_STRETCH)
+    length = min(max(run.size // SPECTRUM_STRETCHES, FEWEST_SAMPLES), LONGEST_STRETCH) // 2 * 2
     window, starts = welch.hann(length), welch.list_starts([slice(0, run.size)], length)
     spectra = welch.transform(np.stack([run[start : start + length] for start in starts]), window)
     density = np.mean(welch.square(spectra), axis=0) * (2.0 * period / np.sum(window**2))
-    if length % 2 == 0:
-        density[-1] *= 0.5  # the Nyquist frequency has no other side
+    density[-1] *= 0.5  # the Nyquist frequency has no other side
     return np.fft.rfftfreq(length, period)[1:], np.sqrt(density[1:])
 
 

@@ -20,7 +20,7 @@ from seaopt.control import (
     tune_schedule,
 )
 from seaopt.control.running.fed_back import close_terms, split_states
-from seaopt.robustness.certificate.scheduled import pose_places
+from seaopt.robustness.certificate.cases import pose
 from seaopt.robustness.uncertainty.batch import batch_figures
 
 HELD, KNEE = so.plants.rotary("locked"), so.plants.rotary("pendulum")
@@ -151,7 +151,7 @@ def test_friction_is_compensated_in_full_where_it_sticks(rubbing):
 def test_a_schedule_is_closed_so_at_each_of_its_places(force):
     schedule = tune_schedule(HELD, VALUES, force.spec, "k_s", [280.0, 320.0])
     schedule = compensate_schedule(schedule, gravity=CompensateGravity(fraction=0.9), link=(KNEE, VALUES))
-    for value, cases in pose_places(schedule, {"knee": KNEE}, VALUES, {}, so.ParameterSet()).items():
+    for value, cases in pose(schedule, {"knee": KNEE}, VALUES, {}, so.ParameterSet()).items():
         plant = cases.plants["knee"]
         found = close_terms(cases.controller, plant).close(plant, cases.unknown.nominal).figures()
         check_figures(found, close_by_hand(cases.controller, k_s=value))
