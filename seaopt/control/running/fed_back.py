@@ -51,7 +51,7 @@ def split_states(
 def _show_terms(plant: Plant, terms: Compensation, signals: tuple[str, ...], stands: bool) -> Plant:
     """Return a plant with outputs of what terms feed back of it; the plant itself where they feed back nothing."""
     gravity, friction, units = terms.gravity, terms.friction, dict[str, str]()
-    if gravity is not None and gravity.reads in plant.outputs:
+    if gravity is not None and {gravity.reads, *signals} <= plant.outputs.keys():
         units[WEIGHT] = plant.outputs[signals[0]]
         gravity = gravity.scaled(1.0 - SHORT) if gravity.fraction == 1.0 else gravity
     # A motor that nothing holds, whose place no loop knows, keeps its drift out of the loop.

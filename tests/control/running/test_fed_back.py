@@ -20,6 +20,7 @@ from seaopt.control import (
     tune_schedule,
 )
 from seaopt.control.running.fed_back import close_terms, split_states
+from seaopt.errors import ControlError
 from seaopt.robustness.certificate.cases import pose
 from seaopt.robustness.uncertainty.batch import batch_figures
 
@@ -165,3 +166,14 @@ def test_a_certificate_is_of_the_loop_with_its_weight(force):
     assert {row.name for row in certificate.requirements if not row.met} >= {"spectral_radius", "gravity_compensation"}
     read = so.Certificate.from_dict(certificate.to_dict(), controller, {"knee": KNEE}, VALUES)
     assert read.plants["knee"] == certificate.plants["knee"] and read.worst["knee"].verify(controller)
+
+
+def test_a_plant_without_what_is_regulated_is_named(force):
+    def h(t, x, u, p):
+        return {name: value for name, value in KNEE.h(t, x, u, p).items() if name != "tau_s"}
+
+    outputs = {name: unit for name, unit in KNEE.outputs.items() if name != "tau_s"}
+    bare = replace(KNEE, name="bare", h=h, outputs=outputs, sensing=None)
+    for controller in (force, weigh(force)):
+        with pytest.raises(ControlError, match='measured = "tau_s" is not an output of bare'):
+            so.certify(controller, {"bare": bare}, VALUES, samples=5, simulations=False)
