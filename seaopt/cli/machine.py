@@ -17,19 +17,20 @@ from seaopt.cli.provenance import FILES
 from seaopt.cli.session import SCHEMAS, Session
 from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
-from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
+from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json, write_text
 from seaopt.logs import write_log
 from seaopt.machine import Acceptance, BringUp, Stage, accept, bring_up
 from seaopt.machine.acceptance import take_ranges
+from seaopt.machine.bringup import OF_A_STAGE, slow_down
 from seaopt.machine.bringup_files import write_stage
 from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
-from seaopt.machine.stepped import Source, limit_law
-from seaopt.problem import certify_problem, tune_problem
+from seaopt.machine.stepped import Source
+from seaopt.problem import Problem, certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
-from seaopt.problem.stages import list_plants
+from seaopt.problem.stages import design_mpc, list_plants
 from seaopt.reporting.sections import judge
 from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.signals import REFERENCE
@@ -119,8 +120,8 @@ def _read_stage(session: Session, path: Path) -> Source:
     """Return the law of a stage of a bring-up."""
     problem, content = session.problem, read_json(path, SCHEMAS["tune"])
     if problem.mpc is not None:
-        limits = content["mpc"]["spec"]
-        return limit_law(session.plan(), limits["current_limit_A"] or limits["command_limit"])
+        stated = {name: content["mpc"]["spec"][name] for name in OF_A_STAGE}
+        return design_mpc(replace(problem, mpc=replace(problem.mpc, **stated)), session.parameters())
     if problem.schedule is not None:
         others = problem.robust_to(session.parameters())
         return ScheduledController.from_dict(content, problem.design_plant, session.values(), others)
@@ -199,16 +200,18 @@ def plan_bring_up(
     if zeroing is not None and isinstance(controller, ForceMPC):
         raise ProblemError(f"--tare {tare}: predictive control has no C beside it that averages a zero; leave it out")
 
-    def tune_stage(spec: ControllerSpec) -> Controller:
-        tuned = tune_problem(replace(session.problem, spec=spec), source)
-        tuned = tuned.controller if isinstance(tuned, JointTuning) else tuned
-        assert isinstance(tuned, Controller)
-        return tuned
+    def tune_stage(fraction: float) -> Source:
+        slower = _slow_down(session.problem, fraction)
+        if slower.mpc is not None:
+            return design_mpc(slower, source)
+        tuned = tune_problem(slower, source)
+        return tuned.controller if isinstance(tuned, JointTuning) else tuned
 
     def certify_stage(law: Source) -> Certificate:
+        problem = session.problem if law is controller else _stand_still(session.problem, law)
         if isinstance(law, ForceMPC):
-            return certify_problem(replace(session.problem, mpc=law.spec), linear_controller(law), source)
-        return certify_problem(session.problem, law, source)
+            return certify_problem(replace(problem, mpc=law.spec), linear_controller(law), source)
+        return certify_problem(problem, law, source)
 
     target = folder / BRING_UP
     with show_progress(errors, "planning the stages", errors.say) as tell:
@@ -227,6 +230,7 @@ def plan_bring_up(
             share=share,
             bias=bias,
             limits=_parse_limits(limits),
+            certificate=session.certificate(),
             tune_stage=tune_stage,
             certify_stage=certify_stage,
             keep_stage=keep_stage,
@@ -242,6 +246,39 @@ def plan_bring_up(
     )
     files = [target / "bringup.json", page, *(target / stage.name for stage in plan.stages)]
     return _show(plan, plan.to_dict(), files, json=json, amount=amount)
+
+
+def _slow_down(problem: Problem, fraction: float) -> Problem:
+    """Return a problem that asks for a fraction of the bandwidth."""
+    spec, mpc, schedule = problem.spec, problem.mpc, problem.schedule
+    if schedule is not None and schedule.bandwidth_hz is not None:
+        problem = _change_schedule(problem, bandwidth_hz=[fraction * band for band in schedule.bandwidth_hz])
+    return replace(
+        problem,
+        spec=None if spec is None else slow_down(spec, fraction),
+        mpc=None if mpc is None else slow_down(mpc, fraction),
+    )
+
+
+def _stand_still(problem: Problem, law: Source) -> Problem:
+    """Return what a stage before the full law is certified by: its schedule's variable stands still. Runs of predictive
+    control last as much longer as it is slower, and are as many fewer where no probability is asked of them.
+    """
+    if problem.schedule is not None:
+        return _change_schedule(problem, min_rate=None)
+    table = problem.robustness
+    if problem.mpc is None or table.max_failure_probability is not None:
+        return problem
+    runs = max(1, round(table.constrained_runs * law.spec.bandwidth_hz / problem.mpc.bandwidth_hz))
+    fewer = table.model_copy(update={"constrained_runs": runs})
+    return replace(problem, table=problem.table.model_copy(update={"robustness": fewer}))
+
+
+def _change_schedule(problem: Problem, **changes: Any) -> Problem:
+    table = problem.controller_table
+    assert table.schedule is not None
+    changed = table.model_copy(update={"schedule": table.schedule.model_copy(update=changes)})
+    return replace(problem, table=problem.table.model_copy(update={"controller": changed}))
 
 
 def _parse_limits(texts: Sequence[str]) -> dict[str, float]:

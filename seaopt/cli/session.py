@@ -24,7 +24,7 @@ from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, warn_delays
 from seaopt.control.laws.stored import CONTROLLER_SCHEMA
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
-from seaopt.errors import ProblemError
+from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, compare_with_log, warn_unidentified
 from seaopt.estimation.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
@@ -472,6 +472,14 @@ class Session:
         )
         self.results["report"] = page
         self.written.append(page)
+
+    def certificate(self) -> Certificate | ScheduleCertificate | None:
+        """Return the folder's certificate; None where there is none of this law and problem."""
+        try:
+            self._read_certificate()
+        except SeaoptError:
+            return None
+        return self.results["certify"]
 
     def _read_certificate(self) -> None:
         """Take the folder's certificate."""

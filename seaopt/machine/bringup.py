@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.codec import to_content
-from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
+from seaopt.control import Controller, ControllerSpec, ForceMPC, MPCSpec, ScheduledController, force_mpc
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
 from seaopt.machine.design_run import run_design
 from seaopt.machine.excitation import Excitation, design_excitation
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
-from seaopt.machine.stepped import Source, limit_law, stand
+from seaopt.machine.stepped import Source, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
@@ -32,7 +32,11 @@ UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
 DRAWS, SEED = 60, 1
 STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
 STOP = 1.3  # times what is predicted: where to stop
+OF_A_STAGE = (  # options of predictive control that a stage may have otherwise
+    "bandwidth_hz", "min_sensitivity_bandwidth_hz", "current_limit_A", "command_limit", "largest_force_N",
+)  # fmt: skip
 PERIODS, PERIODS_OF_PHASES = 10, 4  # of one set of phases, and of each of six
+Spec = TypeVar("Spec", ControllerSpec, MPCSpec)
 
 
 @record
@@ -155,7 +159,7 @@ def bring_up(
     bias: float = 0.0,
     limits: Mapping[str, float] | None = None,
     certificate: Certificate | None = None,
-    tune_stage: Callable[[ControllerSpec], Controller] | None = None,
+    tune_stage: Callable[[float], Source] | None = None,
     certify_stage: Callable[[Any], Certificate] | None = None,
     keep_stage: Callable[[Stage], object] | None = None,
     seed: int = SEED,
@@ -166,8 +170,8 @@ def bring_up(
     Parameters
     ----------
     controller : Controller, ScheduledController or ForceMPC
-        The full law, as tuned. A schedule, or predictive control, is brought up with a fraction of its effort, a
-        schedule at its first point, then whole, a schedule at each of its points.
+        The full law, as tuned. The stages before it are slower laws; of a schedule they stand at its first point, and
+        the full law has a stage at each of its points.
     plants : mapping of name to Plant
         As in `certify`.
     uncertainty : Fit or ParameterSet
@@ -184,10 +188,11 @@ def bring_up(
         The reference's mean, in its unit.
     limits : mapping of str to float, optional
         Largest magnitudes of outputs of the design plant: force and travel.
-    certificate : Certificate, optional
+    certificate : Certificate or ScheduleCertificate, optional
         Of the full law, where there is one.
     tune_stage, certify_stage : callable, optional
-        How a stage's law is tuned and certified, where more than plants and ranges count.
+        How the law at a fraction of the bandwidth is tuned, and how a stage's law is certified, where more than plants
+        and ranges count.
     keep_stage : callable, optional
         Called with each stage as soon as it is planned: the next may take minutes.
     seed : int
@@ -227,13 +232,16 @@ def bring_up(
     def certify_one(law: Any) -> Certificate:
         return certify(law, plants, uncertainty, ranges=ranges, samples=samples, seed=seed)
 
-    def tune_one(spec: ControllerSpec) -> Controller:
-        assert isinstance(controller, Controller) and controller.design is not None
-        plant = controller.design[0]
+    def tune_one(fraction: float) -> Source:
+        assert controller.design is not None
+        if isinstance(controller, ForceMPC):
+            return change_plan(controller, slow_down(controller.spec, fraction))
         options: dict[str, Any] = {"ranges": ranges, "samples": samples, "seed": seed + 1}
-        tuned = tune_certified(plant, uncertainty, spec, plants, **options).controller
-        assert isinstance(tuned, Controller)  # of one specification
-        return tuned
+        if isinstance(controller, ScheduledController):
+            bands = [fraction * band for band in controller.bandwidths_hz]
+            options |= {"over": controller.over, "points": controller.points, "bandwidths_hz": bands}
+        spec = slow_down(controller.spec, fraction)
+        return tune_certified(controller.design[0], uncertainty, spec, plants, **options).controller
 
     certifying, tuning = certify_stage or certify_one, tune_stage or tune_one
     options: dict[str, Any] = {"share": share, "bias": bias, "limits": dict(limits or {}), "seed": seed}
@@ -253,20 +261,28 @@ def bring_up(
         progress(f"stage {len(stages) + 1} of {count}, {text}", len(stages) / count)
 
     for number, fraction in enumerate(sorted(fractions), start=1):
-        if isinstance(controller, Controller):
-            law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell)
-        else:
-            law, note = lower_effort(controller, fraction), f"the law with {100.0 * fraction:g} % of its effort"
-            tell(f"certifying with {100.0 * fraction:g} % of the effort")
-            judged = certifying(law)
+        law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell)
         part = options | {"share": share * fraction, "place": places[0]}
         keep(_make_stage(f"stage_{number}", law, judged, note, draws, part))
-    tell("certifying the law itself")
-    whole = certifying(controller) if certificate is None else certificate
+    if certificate is None:
+        tell("certifying the law itself")
+        certificate = certifying(controller)
     for number, place in enumerate(places, start=1):
         name = "full" if len(places) == 1 else f"full_{number}"
-        keep(_make_stage(name, controller, whole, "", draws, options | {"place": place}))
+        keep(_make_stage(name, controller, certificate, "", draws, options | {"place": place}))
     return BringUp(stages=tuple(stages))
+
+
+def slow_down(spec: Spec, fraction: float) -> Spec:
+    """Return a specification at a fraction of its bandwidth."""
+    changes: dict[str, Any] = {"bandwidth_hz": fraction * spec.bandwidth_hz}
+    if isinstance(spec, ControllerSpec):
+        low, high = spec.bandwidth_range_hz
+        changes["bandwidth_range_hz"] = min(low, fraction * spec.bandwidth_hz), high
+    least = spec.min_sensitivity_bandwidth_hz
+    if isinstance(least, float | int) and least:
+        changes["min_sensitivity_bandwidth_hz"] = fraction * least
+    return replace(spec, **changes)
 
 
 def lower_effort(source: Source, fraction: float) -> Source:
@@ -275,55 +291,48 @@ def lower_effort(source: Source, fraction: float) -> Source:
     if limit is None:
         raise ControlError("the command has no limit to lower; give current_limit_A (command_limit)")
     if isinstance(source, ForceMPC):
-        return replace(limit_law(source, fraction * limit), outer=source.outer)
+        return change_plan(source, replace(_limit(source.spec, fraction * limit), largest_force_N=None))
     if isinstance(source, ScheduledController):
-        lower = tuple(_limit(each, fraction * limit) for each in source.controllers)
-        return replace(source, controllers=lower)
-    return _limit(source, fraction * limit)
+        lower = (replace(each, spec=_limit(each.spec, fraction * limit)) for each in source.controllers)
+        return replace(source, controllers=tuple(lower))
+    return replace(source, spec=_limit(source.spec, fraction * limit))
 
 
-def _limit(controller: Controller, limit: float) -> Controller:
-    spec = controller.spec
-    key = "current_limit_A" if spec.current_limit_A is not None else "command_limit"
-    return replace(controller, spec=replace(spec, **{key: limit}))
+def change_plan(plan: ForceMPC, spec: MPCSpec) -> ForceMPC:
+    """Return predictive control of another specification, with the same guards and outer loop."""
+    return replace(force_mpc(*plan.design, spec, gate=plan.gate, heat=plan.heat), outer=plan.outer)
+
+
+def _limit(spec: Spec, limit: float) -> Spec:
+    return replace(spec, **{"current_limit_A" if spec.current_limit_A is not None else "command_limit": limit})
 
 
 def _find_stage(
-    controller: Controller,
+    source: Source,
     fraction: float,
-    tuning: Callable[[ControllerSpec], Controller],
+    tuning: Callable[[float], Source],
     certifying: Callable[[Any], Certificate],
     tell: Callable[[str], None],
 ) -> tuple[Source, Certificate, str]:
     """Return the law of a stage, its certificate, and in what it is another one than planned."""
-    spec = controller.spec
+    asked = source.spec.bandwidth_hz
     for factor in UPWARDS:
-        band = spec.bandwidth_hz * fraction * factor
-        if band >= 0.95 * spec.bandwidth_hz:
+        part = fraction * factor
+        if part >= 0.95:
             break
-        low, high = spec.bandwidth_range_hz
-        changes: dict[str, Any] = {"bandwidth_hz": band, "bandwidth_range_hz": (min(low, band), high)}
-        if isinstance(spec.min_sensitivity_bandwidth_hz, float | int) and spec.min_sensitivity_bandwidth_hz:
-            changes["min_sensitivity_bandwidth_hz"] = spec.min_sensitivity_bandwidth_hz * band / spec.bandwidth_hz
         try:
-            tell(f"tuning at {band:.3g} Hz")
-            law = tuning(replace(spec, **changes))
+            tell(f"tuning at {part * asked:.3g} Hz")
+            law = tuning(part)
             if not law.met:
                 continue
-            tell(f"certifying at {band:.3g} Hz")
+            tell(f"certifying at {part * asked:.3g} Hz")
             judged = certifying(law)
         except SeaoptError:
             continue
         if judged.met:
-            note = "" if factor == 1.0 else f"{band:.3g} Hz is the nearest to {spec.bandwidth_hz * fraction:.3g} Hz"
+            note = "" if factor == 1.0 else f"{part * asked:.3g} Hz is the nearest to {asked * fraction:.3g} Hz"
             return law, judged, note
-    limit = controller.command_limit
-    if limit is None:
-        raise ControlError(
-            f"no law near {fraction:g} of {spec.bandwidth_hz:g} Hz is certified, and the command has no limit to "
-            "lower; give current_limit_A (command_limit)"
-        )
-    lower = lower_effort(controller, fraction)
+    lower = lower_effort(source, fraction)
     note = (
         f"the full law with {100.0 * fraction:g} % of its effort: none near {fraction:g} of its bandwidth is certified"
     )

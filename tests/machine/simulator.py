@@ -61,18 +61,17 @@ class Machine:
 
 
 class Bench:
-    """A law, exported and compiled, to be run on machines."""
+    """A law, exported and compiled, to be run on machines; `exported`: its C is in the folder already."""
 
-    def __init__(self, compiler, folder, controller, name="law"):
+    def __init__(self, compiler, folder, controller, name="law", *, exported=False):
         self.controller, self.folder = controller, Path(folder) / name
-        kind = []
-        if isinstance(controller, ForceMPC):
-            export_mpc(controller, self.folder)
-            kind = ["-DPLAN"]
-        else:
-            so.export(controller, self.folder, allow_infeasible=True)
+        kind = ["-DPLAN"] if isinstance(controller, ForceMPC) else []
         if isinstance(controller, ScheduledController):
             kind = ["-DPLACED"]
+        if not exported and isinstance(controller, ForceMPC):
+            export_mpc(controller, self.folder)
+        elif not exported:
+            so.export(controller, self.folder, allow_infeasible=True)
         library = self.folder / "machine.so"
         sources = [*map(str, sorted(self.folder.glob("*.c"))), str(SOURCE)]
         flags = ["-O2", "-std=c99", "-ffp-contract=off", "-shared", "-fPIC", *kind, f"-I{self.folder}"]

@@ -86,7 +86,7 @@ def test_the_files_are_there_and_the_c_of_the_reference_is_the_table(plan, compi
 
 
 def test_where_no_slower_law_is_certified_it_is_the_same_with_less_effort(controller):
-    def refuse(spec):
+    def refuse(fraction):
         raise so.SeaoptError("none")
 
     kept = []

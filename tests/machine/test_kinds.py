@@ -131,6 +131,10 @@ def test_predictive_control_at_its_limits_is_replayed(planned):
     assert row.met and row.saturated > 0.02 and row.largest < 1e-6
 
 
+def refuse(fraction):
+    raise so.SeaoptError("no slower law")
+
+
 def test_a_schedule_is_brought_up_with_less_effort_then_at_each_point(schedule, compiler, tmp_path):
     from seaopt.machine.bringup_files import write_bring_up
 
@@ -140,7 +144,7 @@ def test_a_schedule_is_brought_up_with_less_effort_then_at_each_point(schedule, 
         certified.append(law)
         return so.certify(law.at(5e5), {"stand": STAND}, THOR, samples=5, simulations=False)
 
-    options = {"fractions": (0.5,), "limits": {"F1": 900.0}, "certify_stage": certify}
+    options = {"fractions": (0.5,), "limits": {"F1": 900.0}, "certify_stage": certify, "tune_stage": refuse}
     plan = so.bring_up(schedule, {"stand": STAND}, THOR, **options)
     assert [(stage.name, stage.place) for stage in plan.stages] == [("stage_1", 5e5), ("full_1", 5e5), ("full_2", 8e5)]
     first, _, last = plan.stages
@@ -166,7 +170,7 @@ def test_predictive_control_is_brought_up_with_less_effort(planned, tmp_path):
     def certify(law):  # all of a plan's certificate takes a minute
         return so.certify(linear_controller(law), {"stand": STAND}, THOR, samples=5, simulations=False)
 
-    options = {"fractions": (0.5,), "limits": {"F1": 900.0}, "certify_stage": certify}
+    options = {"fractions": (0.5,), "limits": {"F1": 900.0}, "certify_stage": certify, "tune_stage": refuse}
     plan = so.bring_up(mpc, {"stand": STAND}, THOR, **options)
     first, full = plan.stages
     assert first.source.command_limit == 4.5 and full.source is mpc

@@ -70,6 +70,8 @@ class _Bounds:
 
     def hold(self, sides: dict[int, int]) -> _Held:
         """Return the point nearest to the start on which each row has its end: the high one where its side is 1."""
+        if not sides:  # in most samples: nothing to factor
+            return _Held(sides=sides, point=self.start, dual=np.zeros(0), Q=np.eye(self.start.size), R=np.zeros((0, 0)))
         rows, inward = list(sides), -np.array(list(sides.values()), dtype=float)
         normals = inward[:, None] * self.normals[rows]
         ends = inward * np.where(inward < 0.0, self.high[rows], self.low[rows])

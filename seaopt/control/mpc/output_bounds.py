@@ -71,6 +71,8 @@ class OutputBounds:
         """Return the commands at rest, least and largest, that keep the bounds; within the limit of the command. Where
         no command keeps them all, it is the one that breaks them least.
         """
+        if not self.names:
+            return -limit, limit
         moves = np.abs(self.static) > 0.0
         ends = (self.middle[moves] / self.half[moves] + np.array([[-1.0], [1.0]])) / self.static[moves] - drift
         low = float(np.clip(np.max(np.min(ends, axis=0), initial=-limit), -limit, limit))

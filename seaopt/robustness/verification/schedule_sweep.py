@@ -56,6 +56,7 @@ SHARES = tuple(2.0**power for power in range(-7, 0))  # of the least bandwidth: 
 PULSE_PERIODS = 10.0  # of the least bandwidth, that a pulse lasts, and a pause
 LEAST_PULSES = 4
 STEP_SHARE = 0.1  # of the effort that the command's limit leaves
+KICK_SHARE = 0.8  # of that limit, that the command reaches at most as a pulse begins
 DEFAULT_PEAK = 1.3  # of a reference peak, where the specification lifts its limit
 JUDGED_FROM = 0.75  # of a pulse or pause: its end
 SWEEP = ("sweep_from", "sweep_to", "sweep_rad_s")  # parameters of a swept plant
@@ -161,13 +162,16 @@ def describe_sweeps(sweeps: Sequence[Sweep], unit: str) -> str:
 def _choose_pulses(schedule: ScheduledController, plant: Plant, params: ParameterSet) -> _Pulses:
     """Return pulses small enough for the command's limit at every point, and what is allowed of their response."""
     spec, ts = schedule.spec, schedule.spec.sample_time_s
-    samples = math.ceil(PULSE_PERIODS / min(schedule.bandwidths_hz) / ts)
+    samples, loops = math.ceil(PULSE_PERIODS / min(schedule.bandwidths_hz) / ts), schedule.close_points(plant, params)
     left = max(
         abs(loop.measure_step_left(JUDGED_FROM * samples * ts)) / max(abs(loop.tracking(np.zeros(1))[0]), 1e-9)
-        for loop in schedule.close_points(plant, params)
+        for loop in loops
     )
+    limit = schedule.controllers[0].command_limit or math.inf
+    efforts = (float(np.max(np.abs(loop.simulate(np.ones(samples))[1]))) for loop in loops)
+    kick = max(abs(schedule.command.per_effort) * effort for effort in efforts)  # of a pulse of one
     return _Pulses(
-        size=STEP_SHARE * find_least_effort(schedule),
+        size=min(STEP_SHARE * find_least_effort(schedule), KICK_SHARE * limit / kick),
         samples=samples,
         allowed_peak=PEAK_GRACE * (spec.level("max_reference_peak") or DEFAULT_PEAK),
         allowed_left=max(SETTLED, 2.0 * left),
