@@ -473,7 +473,7 @@ class Session:
         self.results["report"] = page
         self.written.append(page)
 
-    def certificate(self) -> Certificate | ScheduleCertificate | None:
+    def certificate(self) -> Certificate | None:
         """Return the folder's certificate; None where there is none of this law and problem."""
         try:
             self._read_certificate()

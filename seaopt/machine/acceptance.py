@@ -203,7 +203,7 @@ def accept(
         place = controller.over, rows[0].middle, controller.unit
     sources = tuple(log.source for log in logs)
     experiments = tuple(
-        make_experiment(law, ticks, row.command_late)
+        replace(make_experiment(law, ticks, row.command_late), law=_hash(controller))
         for ticks, row in zip(rows, replays, strict=True)
         if row.met and row.ticks_per_row == 1 and ticks.rendered is None  # behind an outer loop is another plant
     )
@@ -249,10 +249,11 @@ def _check_header(source: Source, log: Log, row: Replay, others: Mapping[str, Co
     return replace(row, met=False, causes=(cause, *row.causes))
 
 
-def _hash(source: Controller | ScheduledController) -> str:
-    """Return what tells a law from any other, as the log of the target has it."""
+def _hash(source: Source) -> str:
+    """Return what tells a law from any other, as the log of the target has it; of predictive control its linear law."""
     if isinstance(source, ScheduledController):
         return hash_law(source.runnable(), source.controllers[0].outer)
+    source = stand(source, None)
     return hash_law(runnable(source), source.outer)
 
 

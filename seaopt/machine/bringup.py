@@ -188,7 +188,7 @@ def bring_up(
         The reference's mean, in its unit.
     limits : mapping of str to float, optional
         Largest magnitudes of outputs of the design plant: force and travel.
-    certificate : Certificate or ScheduleCertificate, optional
+    certificate : Certificate, optional
         Of the full law, where there is one.
     tune_stage, certify_stage : callable, optional
         How the law at a fraction of the bandwidth is tuned, and how a stage's law is certified, where more than plants

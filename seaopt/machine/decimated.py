@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -57,6 +58,11 @@ Parts = Complex[np.ndarray, "b m"]  # a row per period, or per set of phases, at
 Lines = Complex[np.ndarray, " m"]  # their means over the reference
 
 
+# Of another law: a log has to exclude it; or it is named where a log does not, as few references tell it; or it is only
+# tried as a cause.
+Role = Literal["excluded", "named", "tried"]
+
+
 @record(eq=False)
 class LineMatch:
     """How far the command is from the law's at the lines; nothing where they cannot be compared."""
@@ -84,8 +90,7 @@ class Shift:
     unit: str = ""
     value: float | None = None
     base: float | None = None  # of what is scaled: its size, of which the shift is a half
-    asked: bool = False  # it has to be excluded
-    part: bool = False  # or else is named beside the law: few references tell it
+    role: Role = "tried"
 
     def name(self, share: float, signals: Sequence[str]) -> tuple[str, float | None]:
         """Return its kind and value where a share of it is there."""
@@ -209,7 +214,7 @@ class Table:
         for late in LATE:
             if late != taken:
                 commands = self.made * (self.turn(taken - late) - 1.0)
-                yield Shift(kind="late", what="command", commands=commands, value=late, unit="ticks", asked=True)
+                yield Shift(kind="late", what="command", commands=commands, value=late, unit="ticks", role="excluded")
 
     def turn(self, ticks: int) -> Parts:
         """Return what commands so many ticks earlier are multiplied by."""
@@ -224,11 +229,13 @@ class Table:
         parts = {"reference": fed, controller.command.input: made}
         parts |= {name: feedback[i] * blocks.measured[:, i] for i, name in enumerate(signals)}
         for name, part in parts.items():
-            yield Shift(kind="factor", what=name, commands=-0.5 * part, base=1.0, asked=bool(np.any(part)))
+            role: Role = "excluded" if np.any(part) else "tried"
+            yield Shift(kind="factor", what=name, commands=-0.5 * part, base=1.0, role=role)
         turned = np.exp(-2j * np.pi * blocks.f * controller.sample_time_s)
         for late in (1, 2):
             commands = (made - fed) * (turned**late - 1.0)
-            yield Shift(kind="late", what="readings", commands=commands, value=late, unit="ticks", asked=late == 1)
+            role = "excluded" if late == 1 else "tried"
+            yield Shift(kind="late", what="readings", commands=commands, value=late, unit="ticks", role=role)
         for name, other in others.items():
             if other.signals == signals and math.isclose(other.sample_time_s, law.sample_time_s, rel_tol=1e-3):
                 yield Shift(kind="another law", what=name, commands=self.differ(other.law))
@@ -241,14 +248,14 @@ class Table:
         sizes = gains.by_name()
         for name, half in _halve(gains):
             changed = half.law(structure, period).balanced()
-            asked = _matters(law, changed)
-            yield Shift(kind="gain", what=name, commands=self.differ(changed), base=sizes[name], asked=asked)
+            role: Role = "excluded" if _matters(law, changed) else "tried"
+            yield Shift(kind="gain", what=name, commands=self.differ(changed), base=sizes[name], role=role)
         rates = [factor * period for factor in (0.5, 2.0)]
         parts = [(kind, what, value, "", part.law(structure, period)) for kind, what, value, part in list_parts(gains)]
         parts += [("rate", "gains", 1.0 / each, "Hz", gains.law(structure, each)) for each in rates]
         for kind, what, value, unit, changed in parts:
-            commands, asked = self.differ(changed), _matters(law, changed)
-            yield Shift(kind=kind, what=what, commands=commands, value=value, unit=unit, asked=asked, part=True)
+            role = "named" if _matters(law, changed) else "tried"
+            yield Shift(kind=kind, what=what, commands=self.differ(changed), value=value, unit=unit, role=role)
 
     def differ(self, law: Law) -> Parts:
         """Return what another law makes more than this one."""
@@ -297,9 +304,9 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Mapping[str, Contr
     table = Table.make(controller, ticks, blocks, ticks_per_row)
     tried = [table.try_late(late) for late in LATE]
     found, shifts = min(tried, key=lambda each: each.misfit), [*table.list_shifts(others)]
-    asked, possible = [*shifts, *table.list_late(found.late)], ()
-    vectors = [table.average(shift.commands) for shift in asked]
-    if is_off(found, asked, vectors):
+    every, possible = [*shifts, *table.list_late(found.late)], ()
+    vectors = [table.average(shift.commands) for shift in every]
+    if is_off(found, every, vectors):
         named = [name_causes(each, shifts, vectors, controller.signals) for each in tried]
         at = min(range(len(tried)), key=lambda k: named[k][0])
         found, causes = tried[at], named[at][1]
@@ -309,7 +316,7 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Mapping[str, Contr
             elif table.is_alias(found):
                 causes = (leave_open("aliases", "reference"),)
     else:
-        causes = list_untold(found, asked, vectors, blocks.period_s * len(blocks.reference))
+        causes = list_untold(found, every, vectors, blocks.period_s * len(blocks.reference))
         possible = list_possible(found, shifts, table)
     size = np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0)) * abs(controller.command.per_effort)
     allowed = float(np.sqrt(np.sum((found.std * size) ** 2)))
@@ -350,8 +357,8 @@ def shift_command(controller: Controller, blocks: Blocks, late: int) -> Blocks:
 
 
 def is_off(found: Off, shifts: Sequence[Shift], means: Sequence[Lines]) -> bool:
-    """Tell whether the command is off by more than noise: as a whole, or towards what has to be excluded."""
-    towards = [found.fit(mean) for shift, mean in zip(shifts, means, strict=True) if shift.asked]
+    """Tell whether the command is off by more than noise: as a whole, or towards what is excluded or named."""
+    towards = [found.fit(mean) for shift, mean in zip(shifts, means, strict=True) if shift.role != "tried"]
     return found.misfit > found.most or any(abs(share) > found.sigmas * std for share, std in towards)
 
 
@@ -361,7 +368,7 @@ def list_untold(found: Off, shifts: Sequence[Shift], means: Sequence[Lines], sec
     """
     untold: list[Cause] = []
     for shift, mean in zip(shifts, means, strict=True):
-        if shift.part or not shift.asked or found.excludes(mean):
+        if shift.role != "excluded" or found.excludes(mean):
             continue
         needed, (_, std) = math.inf, found.fit(mean)
         if math.isfinite(std):
@@ -382,7 +389,7 @@ def list_possible(found: Off, shifts: Sequence[Shift], table: Table) -> tuple[Ca
     return tuple(
         Cause(kind=shift.kind, what=shift.what, value=shift.value, unit=shift.unit, removes=0.0, explains=False)
         for shift in shifts
-        if shift.part and shift.asked
+        if shift.role == "named"
         if not all(found.excludes(table.average((made + shift.commands) * turned - made)) for turned in turns)
     )
 

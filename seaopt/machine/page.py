@@ -8,7 +8,7 @@ from pathlib import Path
 
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
-from seaopt.machine.causes import Cause
+from seaopt.machine.causes import Cause, read_gains
 from seaopt.machine.differences import Difference, Differences
 from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Replay
@@ -33,6 +33,10 @@ MISSED = (
 )
 
 
+NO_GAINS = (
+    "The law has no gains with names (it is one's own, or predictive control): a part that is left out, or a gain "
+    "that is another, is not looked for in such a log; log every tick, where all of it counts."
+)
 EVERY_TICK = "of a log with every n-th tick"
 OPEN = {
     "terms": "terms of the law (friction, gravity, ripple) are not linear; log every tick",
@@ -293,6 +297,8 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     remarks += tuple(
         f"A log has one row for {each} ticks: it is compared at the lines of the reference." for each in rows_of
     )
+    if rows_of and read_gains(result.controller) is None:
+        remarks += (NO_GAINS,)
     remarks += tuple(
         f"{Path(source).name} does not exclude that {', or that '.join(map(say_cause, row.possible))}."
         for source, row in zip(result.sources, result.replays, strict=True)

@@ -80,7 +80,7 @@ class SilentLog:
     """A log that says nothing of the law's loop, and why."""
 
     experiment: str
-    why: Literal["lacks a signal", "taken under feedback", "too weak", "an error"]
+    why: Literal["lacks a signal", "taken under feedback", "looks like feedback", "too weak", "an error"]
     detail: str = ""
 
 
@@ -126,7 +126,7 @@ def judge_log(
         whole, *parts = _list_records(fit, experiment, controller)
         runs = whole.runs
         if find_feedback(whole.command, whole.error, runs):
-            return (), silent(why="taken under feedback")
+            return (), silent(why="looks like feedback")
         found = [_judge(controller, fit.parameters, part, part.runs, ms * (1.0 + GRACE)) for part in parts]
         first = _judge(controller, fit.parameters, whole, runs, ms * (1.0 + GRACE))
     except SeaoptError as error:
