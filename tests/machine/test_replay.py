@@ -220,6 +220,25 @@ def test_few_rows_of_a_right_law_are_never_another_and_a_halved_gain_is_never_th
             assert row.undecided or np.isclose(cause.value, 0.5 * controller.gains[name], rtol=0.2)
 
 
+def test_long_logs_of_every_tenth_tick_name_a_halved_derivative_a_weak_drive_and_say_of_a_turned_sign_what_to_check(
+    controller, bench, halved
+):
+    reference = multisine(1000, SLOW, 60, 60.0, 1, bias=300.0)
+
+    def judge(bench, machine):
+        return so.accept(controller, [keep_every(bench.log(machine, reference), 10)])
+
+    right, derivative = judge(bench, Machine()), judge(halved["k_d"], Machine())
+    assert right.replayed and right.differences.inside
+    (row,) = derivative.replays
+    assert (row.causes[0].kind, row.causes[0].what) == ("gain", "k_d")
+    assert np.isclose(row.causes[0].value, 0.5 * controller.gains["k_d"], rtol=0.05)
+    weak = judge(bench, replace(Machine(), per_ampere=0.85 * Machine().per_ampere))
+    assert weak.replayed and np.isclose(weak.differences.found[0].value, 0.85, atol=0.02)
+    turned = judge(bench, replace(Machine(), reading_sign=-1.0))
+    assert turned.replays[0].undecided and "check signs and units" in " ".join(str(turned).split())
+
+
 @pytest.mark.parametrize("every", [2, 10])
 def test_a_law_with_another_part_is_refuted_or_named_beside_this_law(controller, compiler, tmp_path, bench, every):
     from seaopt.control import Gains

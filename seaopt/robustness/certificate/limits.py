@@ -47,8 +47,8 @@ LOG_SENSITIVITY = "log_sensitivity"
 NO_LOG = "no log of the fit is of a plant that is certified, so that none judges the law"
 SILENT = {
     "lacks a signal": "log {0.experiment} does not judge the law: it has no {0.detail}",
-    "looks like feedback": "log {0.experiment} looks like feedback: its input answers its noise, and it judges no law; if "
-    "it was taken under one, write feedback = true",
+    "looks like feedback": "log {0.experiment} looks like feedback: its input answers its noise, and it judges no law; "
+    "if it was taken under one, write feedback = true",
     "taken under feedback": "log {0.experiment} was taken under feedback: its input carries its noise, and it judges "
     "no law",
     "too weak": "log {0.experiment} says nothing of this loop: it is too short, or too weak",
