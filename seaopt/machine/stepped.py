@@ -45,6 +45,7 @@ from seaopt.robustness import linear_controller
 SETTLED = 400  # rows over which the estimate of predictive control follows the log
 SAME_PLACE = 0.02  # of the span of a schedule's points: a variable that moves less stands still
 FLOOR = 1e-3  # of the command's variation: a mismatch below is none
+EXACT = 1e-3  # of that, below which a start is the right one
 ROUNDING = 2.0  # times the std that rounding leaves by the estimate: a mismatch up to there is rounding
 HEAD = 400  # rows that tell the state at the first
 HEAD_DECAYS, LONGEST_HEAD = 3.0, 20000  # time constants of the slowest part that they last besides, and rows at most
@@ -193,7 +194,9 @@ def play(setting: Setting) -> Match:
     ticks, linear = setting.ticks, setting.linear
     head = ticks.take(slice(0, count_head(linear)))
     allowed = _allow(linear, ticks)
-    allowed_head = allowed[: len(head)]
+    allowed_head, floor = allowed[: len(head)], FLOOR * float(np.std(ticks.command))
+    # A start that is nearly right drifts in the integrals: what the floor allows is not taken for rounding.
+    exact = float(np.mean(allowed_head**2)) - (1.0 - EXACT**2) * floor**2
     best: tuple[State, int] | None = None
     error = np.inf
 
@@ -207,7 +210,7 @@ def play(setting: Setting) -> Match:
         off = float(np.mean((run_setting(setting, rows, start) - rows.command) ** 2))
         if off < error:
             best, error = (start, first), off
-        if error <= np.mean(allowed_head**2):
+        if error <= exact:
             break
     assert best is not None
     start, first = best
