@@ -583,7 +583,6 @@ def _design(
     outputs = bound_outputs(spec.bounds, kalman, sampled, interpolate_knots(knots), limit)
     preview = max(spec.preview_samples - kalman.delay_samples, 0)
     prediction = condense(sampled, regulator, knots, limit, spec.slew_per_sample_A, preview, outputs)
-    shift = np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)])
     return ForceMPC(
         spec=spec,
         design=design,
@@ -592,7 +591,7 @@ def _design(
         prediction=prediction,
         static_gain=gain,
         rest=sampled.rest,
-        shift=shift,
+        shift=np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)]),
         solver=factor_program(stack_hessian(prediction), prediction.rows),
         gate=gate,
         heat=heat,
