@@ -49,6 +49,7 @@ from seaopt.robustness.verification.scenarios import SETTLED, Scenario
 
 SETTLE = 0.2  # of the last phase, which is not judged
 GROWTH, GROWTH_FLOOR = 1.05, 1e-3
+ROUNDING = 1e-24  # of the largest energy or square of an error, below which it is rounding: neither grows nor decays
 OUTBREAK, OUTLIER = 2.0, 6.0
 LINE_SIGMAS = 4.0  # standard deviations of noise that a line in its spectrum stays below: the amplitude is Rayleigh's
 MEAN_SIGMAS = 4.0  # standard deviations that a mean of noise stays below
@@ -323,8 +324,10 @@ def _judge_growth(run: _Run, findings: _Findings) -> None:
     last = level[-(trace.edges[-1] - trace.edges[-2]) :]
     last = last[int(SETTLE * last.size) :]
     first, second = (float(np.max(half)) for half in np.array_split(last, 2))
-    growth = findings.figures["energy_growth"] = second / max(first, 1e-300)
-    if second > GROWTH * first + GROWTH_FLOOR * float(np.max(level)):
+    largest = float(np.max(level))
+    growth = second / max(first, 1e-300) if second > ROUNDING * largest else 0.0
+    findings.figures["energy_growth"] = growth
+    if second > GROWTH * first + GROWTH_FLOOR * largest:
         findings.add("growth", f"{what} grows {growth:.3g} times while the reference is constant")
 
 
