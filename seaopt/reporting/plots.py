@@ -242,6 +242,20 @@ def _list_sweeps(certificate: Certificate) -> tuple[LargeSignal, ...]:
     return sweeps
 
 
+def _draw_one_place(name: str, make: Make) -> Make:
+    """Return what draws a figure of one law, and says of a schedule where each of its laws has it."""
+
+    @wraps(make)
+    def draw(certificate: Certificate, *args: Any, **options: Any) -> Panels:
+        if certificate.schedule is not None:
+            raise ControlError(
+                f"{name} of a schedule is drawn at each of its places: certificate.places[0].plot.{name}()"
+            )
+        return make(certificate, *args, **options)
+
+    return draw
+
+
 def _list_certificate(certificate: Certificate) -> Iterator[Callable[[], Panels]]:
     if certificate.schedule is not None:
         yield partial(schedule_panels, certificate.schedule, certificate)
@@ -255,8 +269,6 @@ def _list_certificate(certificate: Certificate) -> Iterator[Callable[[], Panels]
 
 def _draw_steps(certificate: Certificate, *, size: float = 1.0, duration_s: float | None = None) -> Panel:
     """Draw the step response of every plant, linear; `ax` is a sequence of two Axes."""
-    if certificate.schedule is not None:
-        raise ControlError("a schedule has a step at each of its places: certificate.places[0].plot.step()")
     plants = certificates.plants_of(certificate)
     return loops.step_panel(certificate.controller, plants, size=size, duration_s=duration_s)
 
@@ -317,6 +329,17 @@ _DIAGNOSTICS = {
     "autocorrelation": _draw_diagnostics(fits.autocorrelation_panel),
     "inputs": _draw_diagnostics(fits.input_correlation_panel),
 }
+_ONE_PLACE: dict[str, Make] = {
+    "sensitivity": certificates.worst_panel,
+    "draws": certificates.draws_panel,
+    "step": _draw_steps,
+    "friction": certificates.friction_panel,
+    "bandwidth": _draw_bandwidths,
+    "amplitude": _draw_amplitudes,
+    "simulations": _draw_simulations,
+    "environments": _draw_environments,
+    "impedance": _draw_impedance,
+}
 KINDS = {
     "Fit": Kind(
         figures={
@@ -348,15 +371,7 @@ KINDS = {
     "Certificate": Kind(
         figures={
             "requirements": certificates.requirements_panel,
-            "sensitivity": certificates.worst_panel,
-            "draws": certificates.draws_panel,
-            "step": _draw_steps,
-            "friction": certificates.friction_panel,
-            "bandwidth": _draw_bandwidths,
-            "amplitude": _draw_amplitudes,
-            "simulations": _draw_simulations,
-            "environments": _draw_environments,
-            "impedance": _draw_impedance,
+            **{name: _draw_one_place(name, make) for name, make in _ONE_PLACE.items()},
         },
         sheet=_list_certificate,
     ),

@@ -238,8 +238,9 @@ def _sort_results(results: Sequence[Result]) -> Material:
 def _list_plates(material: Material) -> Iterator[Plate]:
     """Yield every figure that the results allow; figures of a part in the order of the page."""
     controller, certificate, fit = material.controller, material.certificate, material.fit
-    if controller is not None and (controller.design is not None or (certificate is not None and certificate.models)):
-        plants = None if certificate is None else certificates.plants_of(certificate)
+    of_law = None if certificate is None or certificate.schedule is not None else certificate
+    if controller is not None and (controller.design is not None or (of_law is not None and of_law.models)):
+        plants = None if of_law is None else certificates.plants_of(of_law)
         panels = [loops.LOOP_PANELS[name](controller, plants) for name in loops.MAIN]
         yield Plate(name="loop", part="controller", heading="The loop on every plant" if plants else "", panels=panels)
     if material.schedule is not None:
@@ -249,8 +250,8 @@ def _list_plates(material: Material) -> Iterator[Plate]:
     if material.ranking is not None:
         panels = [evidence_panel(material.ranking), *octave_panels(material.ranking)]
         yield Plate(name="ranking", part="ranking", panels=panels)
-    if certificate is not None and certificate.schedule is None:
-        yield Plate(name="certificate", part="certificate", panels=_list_certificate_panels(certificate))
+    if of_law is not None:
+        yield Plate(name="certificate", part="certificate", panels=_list_certificate_panels(of_law))
     yield from _list_plates_of_simulation(material)
 
 

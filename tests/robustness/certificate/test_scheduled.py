@@ -15,6 +15,7 @@ from seaopt.errors import ControlError, FileError
 from seaopt.executors import Shared
 from seaopt.files import to_json
 from seaopt.progress import ignore
+from seaopt.reporting.page.report import _list_plates, _sort_results
 from seaopt.robustness.certificate import scheduled
 from seaopt.robustness.certificate.cases import CertifyOptions, Survey, add_design, pose
 from seaopt.robustness.certificate.friction import FRICTION, MarginDraws
@@ -53,6 +54,20 @@ def test_its_figures_are_those_of_the_law_on_the_plant_there(certificate):
         here = values.update(phi=value)
         expected = certificate.schedule.at(value).close(swing, here).figures()
         assert place.plants["swing"].ms == pytest.approx(expected.ms, rel=1e-9)
+
+
+def test_what_is_of_one_law_is_drawn_at_a_place_alone(certificate):
+    names = {*dir(certificate.plot)} - {"requirements"}
+    assert names >= {"sensitivity", "step", "bandwidth", "impedance", "friction", "draws"}
+    for name in names:
+        with pytest.raises(ControlError, match=rf"certificate\.places\[0\]\.plot\.{name}\(\)"):
+            getattr(certificate.plot, name)()
+    place = certificate.places[-1]
+    drawn = {line.get_label(): line.get_ydata() for line in place.plot.sensitivity().lines}
+    assert 10.0 ** (np.max(drawn["swing"]) / 20.0) == pytest.approx(place.plants["swing"].ms, rel=1e-4)
+    law = replace(certificate.controller, robust_to={})
+    plates = {plate.name: plate for plate in _list_plates(_sort_results([law, certificate]))}
+    assert {*plates} == {"loop", "schedule"} and not plates["loop"].heading  # of the law on its design plant
 
 
 def test_every_stretch_is_proved_and_above_what_was_found(certificate):
