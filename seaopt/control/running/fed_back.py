@@ -11,6 +11,13 @@ the law a column for it,
 With a weight the impedance's outer loop is closed, too: it may be what holds a weightless link. Friction is
 compensated in full where the plant is stuck; where it slides both it and its compensation have their full size and no
 slope. All of a weight compensated leaves a link neutral, on the edge of stability: it is closed with `SHORT` less.
+
+Where nothing holds the link the motor's place drifts, and its difference does not. There the plant has a state
+:math:`\dot m = \dot\theta - (\epsilon / T_s) m` for it, of which the law reads
+
+.. math:: m_k - e^{-\epsilon} m_{k-1} = \int_0^{T_s} e^{-\epsilon (1 - t / T_s)}\, \dot\theta\, dt,
+
+the difference to a share of :math:`\epsilon / 2`; its own eigenvalue :math:`e^{-\epsilon}` is in nothing that is read.
 """
 
 from __future__ import annotations
@@ -34,6 +41,7 @@ from seaopt.plants.memo import memo
 
 WEIGHT, AGAINST = "weight compensated", "friction compensated"  # outputs: of the link's position, of the motor's
 SHORT = 1e-4  # of a weight that is compensated whole
+TURNED, FORGOTTEN = "motor_turned", 1e-4  # a state, of the motor's place, and how much of it is forgotten in a period
 
 
 def split_states(
@@ -50,13 +58,13 @@ def split_states(
 @memo
 def _show_terms(plant: Plant, terms: Compensation, signals: tuple[str, ...], stands: bool) -> Plant:
     """Return a plant with outputs of what terms feed back of it; the plant itself where they feed back nothing."""
-    gravity, friction, units = terms.gravity, terms.friction, dict[str, str]()
+    gravity, friction, units, forgets = terms.gravity, terms.friction, dict[str, str](), False
     if gravity is not None and {gravity.reads, *signals} <= plant.outputs.keys():
         units[WEIGHT] = plant.outputs[signals[0]]
         gravity = gravity.scaled(1.0 - SHORT) if gravity.fraction == 1.0 else gravity
-    # A motor that nothing holds, whose place no loop knows, keeps its drift out of the loop.
-    if friction is not None and stands and friction.reads in leave_out_drift(plant, signals).outputs:
+    if friction is not None and stands and friction.reads in plant.outputs:
         units[AGAINST] = plant.outputs[friction.reads]
+        forgets = friction.reads not in leave_out_drift(plant, signals).outputs
     if not units:
         return plant
 
@@ -66,10 +74,28 @@ def _show_terms(plant: Plant, terms: Compensation, signals: tuple[str, ...], sta
             weight = Compensation(sample_time_s=terms.sample_time_s, gravity=gravity)
             shown[WEIGHT] = compensate(weight.shape, weight.numbers, (), 0.0, [read[gravity.reads]], ca)[0]
         if AGAINST in units and friction is not None:
-            shown[AGAINST] = friction.effort * friction.share_per_step(terms.sample_time_s) * read[friction.reads]
+            turned = getattr(x, TURNED) if forgets else read[friction.reads]
+            shown[AGAINST] = friction.effort * friction.share_per_step(terms.sample_time_s) * turned
         return {**read, **shown}
 
+    if friction is not None and forgets:
+        plant = _add_turned(plant, friction.reads, FORGOTTEN / terms.sample_time_s)
     return replace(plant, h=h, outputs={**plant.outputs, **units})
+
+
+def _add_turned(plant: Plant, output: str, rate: float) -> Plant:
+    """Return a plant with a state that moves as an output does and forgets at a rate (1/s) where it is."""
+    at = plant.output[list(plant.outputs).index(output)]
+    speed = ca.Function("speed", [*plant.symbols], [ca.jtimes(at, plant.x, plant.dynamics)])
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
+        vectors = (
+            ca.vertcat(*(getattr(space, name) for name in names))
+            for space, names in ((x, plant.states), (u, plant.inputs), (p, plant.parameters))
+        )
+        return {**plant.f(t, x, u, p), TURNED: speed(t, *vectors) - rate * getattr(x, TURNED)}
+
+    return replace(plant, f=f, states={**plant.states, TURNED: plant.outputs[output]})
 
 
 def close_terms(controller: Controller, plant: Plant) -> Controller:
@@ -91,6 +117,7 @@ def close_terms(controller: Controller, plant: Plant) -> Controller:
         n, columns = law.b.shape
         a, b = np.zeros((n + 1, n + 1)), np.zeros((n + 1, columns + 1))
         a[:n, :n], b[:n, :columns], b[n, columns] = law.a, law.b, 1.0  # the last sample's is kept
-        c, d = np.append(law.c, -1.0), np.append(law.d, 1.0)
+        kept = np.exp(-FORGOTTEN) if TURNED in plant.states else 1.0
+        c, d = np.append(law.c, -kept), np.append(law.d, 1.0)
         law, signals = Law(a=a, b=b, c=c, d=d, sample_time_s=law.sample_time_s), (*signals, AGAINST)
     return replace(controller, law=law, reads=signals, compensation=None, outer=None)

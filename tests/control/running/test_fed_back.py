@@ -24,7 +24,7 @@ from seaopt.errors import ControlError
 from seaopt.robustness.certificate.cases import pose
 from seaopt.robustness.uncertainty.batch import batch_figures
 
-HELD, KNEE = so.plants.rotary("locked"), so.plants.rotary("pendulum")
+HELD, KNEE, FREE = (so.plants.rotary(link) for link in ("locked", "pendulum", "free"))
 VALUES = KNEE.defaults.update(
     N=100.0, K_tau=0.0369, eta=0.7, J_m=2.4e-5, b_r=1e-4, k_s=300.0, J_l=0.25, d_l=0.3, m=3.0, L=0.25, f_c=0.0, v_s=1.0
 )
@@ -147,6 +147,24 @@ def test_friction_is_compensated_in_full_where_it_sticks(rubbing):
     check_figures(found, hand)
     without = rubbing.close(stuck, RUBBING).figures()
     assert found.ms != pytest.approx(without.ms, rel=1e-3)
+
+
+def test_friction_is_compensated_where_nothing_holds_a_link_too(rubbing):
+    """The motor's place drifts, an eigenvalue of 1 by hand, and is left out."""
+    term = rubbing.compensation.friction
+    _, stuck = split_states(rubbing, {"free": FREE}, RUBBING).values()
+    per_step = term.effort / term.speed * term.velocity_per_rate / TS
+    hand = close_by_hand(rubbing, rubs=0.004, against=per_step, share=0.0, m=0.0)
+    found = close_terms(rubbing, stuck).close(stuck, RUBBING).figures()
+    radii = np.sort(np.abs(hand.poles()))
+    assert radii[-1] == pytest.approx(1.0, abs=1e-9)
+    assert found.spectral_radius == pytest.approx(radii[-2], abs=1e-8) and found.stable
+    f = np.concatenate([np.geomspace(0.01, 2.0, 2000), np.linspace(2.0, 499.0, 10_000)])
+    size = np.abs(hand(np.exp(2j * np.pi * f * TS))[0, 0])
+    np.testing.assert_allclose(found.ms, np.max(size), rtol=2e-5)
+    drawn = batch_figures(rubbing, stuck, RUBBING, {"k_s": np.array([300.0])})
+    np.testing.assert_allclose((drawn.ms[0], drawn.spectral_radius[0]), (found.ms, found.spectral_radius), rtol=1e-6)
+    assert abs(rubbing.close(stuck, RUBBING).figures().ms - found.ms) > 0.03
 
 
 def test_a_schedule_is_closed_so_at_each_of_its_places(force):
