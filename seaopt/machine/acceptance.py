@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import field, replace
 from typing import Any
 
@@ -156,7 +157,8 @@ def accept(
     Laws with another part that it does not exclude are its replay's `possible`.
 
     A law with an outer loop is replayed with it where the reference is the link's place, in m or rad, and the link's
-    position is in the log; no response follows. A reference in N or N m is the one that the force law was given.
+    position is in the log; no response follows. A reference in N or N m is the one that the force law was given, or,
+    without a stiffness, the force that the outer loop's damping is added to: whichever the law makes the command of.
 
     A schedule is replayed as its variable moves; its response is judged where that stands still, against the figures
     that the law has there. Predictive control is replayed with its limits; its response is that of the law while none
@@ -192,11 +194,16 @@ def accept(
         raise LogError(f"confidence = {confidence:g} is not between 0.5 and 1; give 0.95")
     if ranges and controller.design is not None:
         check_ranges(ranges, {"design plant": controller.design[0]})
-    rows = list_ticks(controller, logs, reference, at)
-    replays = tuple(
-        _check_header(controller, log, replay(controller, ticks, others), others or {})
-        for log, ticks in zip(logs, rows, strict=True)
-    )
+    rows, replays = list[Ticks](), list[Replay]()
+    for log, ticks in zip(logs, list_ticks(controller, logs, reference, at), strict=True):
+        tried, outer = [(ticks, replay(controller, ticks, others))], stand(controller, at).outer
+        if not tried[0][1].met and outer is not None and not outer.stiffness and outer.position in log.signals:
+            with suppress(LogError):  # the position has gaps
+                (before,) = list_ticks(controller, [log], reference, at, before=True)
+                tried.append((before, replay(controller, before, others)))
+        chosen, row = max(tried, key=lambda pair: (pair[1].met, pair[1].explained, pair[1].undecided))
+        rows.append(chosen)
+        replays.append(_check_header(controller, log, row, others or {}))
     law = stand(controller, rows[0].middle)
     place = None
     if isinstance(controller, ScheduledController) and rows[0].middle is not None:
@@ -207,7 +214,7 @@ def accept(
         for ticks, row in zip(rows, replays, strict=True)
         if row.met and row.ticks_per_row == 1 and ticks.rendered is None  # behind an outer loop is another plant
     )
-    result = Acceptance(controller=law, sources=sources, replays=replays, place=place, experiments=experiments)
+    result = Acceptance(controller=law, sources=sources, replays=tuple(replays), place=place, experiments=experiments)
     if not result.replayed:
         told = any(not row.met and not row.undecided for row in replays)
         return replace(result, left_out={"response": OTHER_LAW if told else UNTOLD_LAW})
@@ -240,8 +247,7 @@ def _check_header(source: Source, log: Log, row: Replay, others: Mapping[str, Co
     """Return a replay with the law that the log says it was taken under, where that is another and the replay does not
     tell why.
     """
-    explained = bool(row.causes) and row.causes[0].explains
-    if explained or isinstance(source, ForceMPC) or log.law in ("", _hash(source)):
+    if row.explained or isinstance(source, ForceMPC) or log.law in ("", _hash(source)):
         return row
     named = [name for name, other in others.items() if _hash(other) == log.law]
     kind, what = ("another law", named[0]) if named else ("law by the log's header", f"another, {log.law}")
@@ -257,7 +263,9 @@ def _hash(source: Source) -> str:
     return hash_law(runnable(source), source.outer)
 
 
-def list_ticks(source: Source, logs: Sequence[Log], reference: str | None, at: float | None) -> list[Ticks]:
+def list_ticks(
+    source: Source, logs: Sequence[Log], reference: str | None, at: float | None, *, before: bool = False
+) -> list[Ticks]:
     """Return the ticks of logs. Raises LogError: those of a schedule stand at different values, or at none of it."""
     over = source.over if isinstance(source, ScheduledController) else None
     if at is not None:
@@ -265,7 +273,7 @@ def list_ticks(source: Source, logs: Sequence[Log], reference: str | None, at: f
         if over is None:
             raise LogError(f"at = {at:g}: the law is not scheduled; leave it out")
     law = stand(source, at)
-    rows = [take_ticks(law, log, reference, over, at) for log in logs]
+    rows = [take_ticks(law, log, reference, over, at, before=before) for log in logs]
     if not isinstance(source, ScheduledController):
         return rows
     low, high = source.points[0], source.points[-1]

@@ -41,9 +41,10 @@ def judge(result: BringUp, commands: Commands) -> Verdict | None:
 
 OUTER = (
     "These stages are of the force law alone: leave the outer loop out, with the link as in the design plant, and give "
-    "the law the reference itself. Close the outer loop after the last stage, and log its x_0 as the reference, with "
-    "the link's position: seaopt accept replays both."
+    "the law the reference itself. Close the outer loop after the last stage, and log {}"
 )
+PLACE = "its x_0 as the reference, with the link's position: seaopt accept replays both."
+FORCE = "what step was given as the reference; or, with the link's position, the force that the damping is added to."
 
 
 def summarise(result: BringUp) -> list[KeyFigure]:
@@ -60,7 +61,8 @@ def describe(result: BringUp) -> list[Section]:
     """Return a table of the stages, then each with what to play, to log, to expect, and when to stop."""
     rows = tuple(_list_row(stage) for stage in result.stages)
     head = ("stage", "law", "bandwidth (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
-    outer = (OUTER,) if result.stages[-1].controller.renders else ()
+    last = result.stages[-1].controller
+    outer = () if last.outer is None else (OUTER.format(PLACE if last.renders else FORCE),)
     overview = Section(
         title="Stages",
         part="stages",

@@ -26,7 +26,6 @@ LEAST_HEAD = 60  # rows within the limit that factors take
 WINDOW = 2000  # rows on which causes are tried, about the largest mismatch
 EVERY = (2, 3, 4, 5, 10)  # rows per tick of a law that is slower than the logger
 UNITS = tuple(each**power for each in (1e3, 60.0 / (2.0 * math.pi), 180.0 / math.pi, 1e6, 1e2) for power in (-1, 1))
-RENDERED = ("stiffness", "damping")  # of an outer loop
 SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
 MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
 MOST_CAUSES = 6
@@ -166,9 +165,9 @@ def _list_of_time(setting: Setting) -> Iterator[Alternative]:
 def _scale(what: str, factor: float, setting: Setting) -> Setting:
     """Return a setting in which the law is given, or its command is, a factor times what it was."""
     ticks, controller = setting.ticks, setting.controller
-    if ticks.rendered is not None and what in RENDERED:
-        parts = ticks.rendered * np.where(np.array(RENDERED) == what, factor, 1.0)
-        return replace(setting, ticks=replace(ticks, reference=np.sum(parts, axis=1), rendered=parts))
+    if ticks.rendered is not None and what in ticks.rendered:
+        parts = ticks.rendered | {what: factor * ticks.rendered[what]}
+        return replace(setting, ticks=replace(ticks, reference=np.sum([*parts.values()], axis=0), rendered=parts))
     if what == "reference":
         return replace(setting, ticks=replace(ticks, reference=factor * ticks.reference))
     if what in controller.signals:
@@ -181,8 +180,12 @@ def _scale(what: str, factor: float, setting: Setting) -> Setting:
 def _list_factors(setting: Setting) -> Iterator[Alternative]:
     """Yield signs, units and other factors of reference, readings and command."""
     fitted = _fit_factors(setting)
-    rendered = () if setting.ticks.rendered is None else RENDERED
-    for what in (*rendered, "reference", *setting.controller.signals, setting.controller.command.input):
+    for what in (
+        *(setting.ticks.rendered or ()),
+        "reference",
+        *setting.controller.signals,
+        setting.controller.command.input,
+    ):
         factor = fitted.get(what)
         usual = [-1.0, *UNITS] if factor is None else [factor]
         for each in dict.fromkeys([-1.0, *usual]):
@@ -216,7 +219,7 @@ def _fit_factors(setting: Setting) -> dict[str, float]:
         return {}
     nothing = replace(ticks, reference=0.0 * ticks.reference, measured=0.0 * ticks.measured)
     parts = {"reference": follow(law, replace(nothing, reference=ticks.reference), limited, 0.0)}
-    for name, part in zip(RENDERED, () if ticks.rendered is None else ticks.rendered.T, strict=False):
+    for name, part in (ticks.rendered or {}).items():
         parts[name] = follow(law, replace(nothing, reference=part), limited, 0.0)
     for i, name in enumerate(setting.controller.signals):
         measured = np.zeros_like(ticks.measured)

@@ -41,6 +41,11 @@ class Replay:
     possible: tuple[Cause, ...] = ()  # of a log with every n-th tick: laws with other parts that it does not exclude
 
     @property
+    def explained(self) -> bool:
+        """Whether its first cause makes the logged command."""
+        return bool(self.causes) and self.causes[0].explains
+
+    @property
     def undecided(self) -> bool:
         """Whether the log cannot tell this law from another."""
         return bool(self.causes) and self.causes[0].undecided

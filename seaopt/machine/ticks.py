@@ -34,9 +34,7 @@ class Ticks:
     further: Float[np.ndarray, "n r"]  # what its terms and its gate read besides
     command: Float[np.ndarray, " n"]
     place: Float[np.ndarray, " n"] | None = None  # of a schedule, its variable
-    rendered: Float[np.ndarray, "n 2"] | None = (
-        None  # stiffness and damping of an outer loop, of which reference is the sum
-    )
+    rendered: dict[str, Float[np.ndarray, " n"]] | None = None  # parts of an outer loop, of which reference is the sum
     left_out: int = 0  # rows of the log that are in no such stretch
 
     def __len__(self) -> int:
@@ -51,7 +49,7 @@ class Ticks:
             measured=self.measured[read],
             further=self.further[read],
             place=None if self.place is None else self.place[read],
-            rendered=None if self.rendered is None else self.rendered[rows],
+            rendered=self.rendered and {name: part[rows] for name, part in self.rendered.items()},
             command=self.command[rows if command is None else command],
         )
 
@@ -83,16 +81,24 @@ class Ticks:
 
 
 def take_ticks(
-    controller: Controller, log: Log, reference: str | None = None, over: str | None = None, at: float | None = None
+    controller: Controller,
+    log: Log,
+    reference: str | None = None,
+    over: str | None = None,
+    at: float | None = None,
+    *,
+    before: bool = False,
 ) -> Ticks:
     """Return the ticks of a log whose channels carry the names of the controller's signals, of the input that it
     commands, and of its reference. `over`: the variable of its schedule, which was `at` a value where the log does not
-    have it. Raises LogError: a channel is missing, or no stretch is long enough.
+    have it. `before`: the reference is a force, to which its outer loop without a stiffness adds the damping. Raises
+    LogError: a channel is missing, or no stretch is long enough.
     """
     command, names = controller.command, (*controller.signals, *controller.further)
     called = [reference] if reference is not None else [name for name in REFERENCES if name in log.signals]
-    around = controller.outer if controller.renders else None
-    if around is not None and called and called[0] in log.signals and log.signal(called[0]).unit != around.place_unit:
+    around = controller.outer if controller.renders or before else None
+    given = log.signal(called[0]).unit if called and called[0] in log.signals else None
+    if around is not None and controller.renders and given not in (None, around.place_unit):
         around = None  # the force law's own reference, whatever it comes from
     if around is not None:
         names = tuple(dict.fromkeys((*names, around.position)))
@@ -139,13 +145,13 @@ def take_ticks(
 
 
 def _render(ticks: Ticks, outer: OuterLoop, position: Float[np.ndarray, " n"]) -> Ticks:
-    """Return ticks whose reference is what an outer loop makes of the link's place and position, but for the first, in
-    which its filter forgets what was before the log.
+    """Return ticks whose reference is what an outer loop makes of what it is given and the link's position, but for the
+    first, in which its filter forgets what was before the log.
     """
-    stiff, lax = replace(outer, damping=0.0), replace(outer, stiffness=0.0)
-    parts = np.column_stack([each.run(ticks.reference, position) for each in (stiff, lax)])
+    asked, damping = outer.ask(ticks.reference, position), replace(outer, stiffness=0.0).run(ticks.reference, position)
+    parts = {"stiffness" if outer.stiffness else "force": asked - damping, "damping": damping}
     first = min(math.ceil(FORGETS / -math.log(outer.pole)) if outer.pole else 1, len(ticks) - FEWEST)
-    return replace(ticks, reference=np.sum(parts, axis=1), rendered=parts).take(slice(max(first, 1), None))
+    return replace(ticks, reference=asked, rendered=parts).take(slice(max(first, 1), None))
 
 
 def _find_longest(log: Log, whole: Any) -> slice:

@@ -14,20 +14,30 @@ KNEE = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "k_s"
 INERTIA, DAMPER = 0.5, 2.0  # of the link
 
 
-@pytest.fixture(scope="module")
-def impedance():
-    """Return a knee's law that renders a stiffness at its link."""
+def make_knee(stiffness):
+    """Return a knee's law that renders an impedance at its link."""
     knee = so.plants.rotary()
     values = knee.complete(so.ParameterSet()).update(**KNEE)
     spec = so.ControllerSpec(bandwidth_hz=20, measured="tau_s", current_limit_A=9.0, max_noise_gain=45)
     law = so.tune(so.plants.rotary(link="locked"), values, spec)
-    return add_impedance(
-        law, knee, values, Impedance(stiffness=20.0, damping=1.0, velocity_filter_s=0.005), name="knee"
-    )
+    asked = Impedance(stiffness=stiffness, damping=1.0, velocity_filter_s=0.005)
+    return add_impedance(law, knee, values, asked, name="knee")
+
+
+@pytest.fixture(scope="module")
+def impedance():
+    return make_knee(20.0)
+
+
+@pytest.fixture(scope="module")
+def damping():
+    return make_knee(0.0)
 
 
 def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1):
-    """Return x_0, the force reference, the torque, the link's angle, and the command, a row per tick."""
+    """Return x_0, or the force asked for where the law has no stiffness, then the force reference, the torque, the
+    link's angle, and the command, a row per tick.
+    """
     rng, outer = np.random.default_rng(seed), law.outer
     mass, kick = KNEE["N"] ** 2 * KNEE["J_m"], KNEE["N"] * KNEE["eta"] * KNEE["K_tau"]
     a = np.zeros((5, 5))  # motor's angle at the output, its speed, the link's, its speed, current
@@ -47,6 +57,7 @@ def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1):
         speed = (0.005 * speed + seen - before) / (0.005 + T)
         before = seen
         asked = outer.direction * (stiffness * (goal[k] - seen) - damping * speed)
+        asked += 0.0 if outer.stiffness else goal[k]
         effort = law.law.c @ state + law.law.d @ np.array([asked, torque])
         state = law.law.a @ state + law.law.b @ np.array([asked, torque])
         current = effort * law.per_effort
@@ -56,15 +67,16 @@ def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1):
     return rows
 
 
-def make_log(rows, *, inner=False, position=True):
+def make_log(rows, *, inner=False, position=True, unit="rad"):
     columns = {"reference": rows[:, 1 if inner else 0], "tau_s": rows[:, 2], "I": rows[:, 4]}
-    units = {"reference": "N m" if inner else "rad", "tau_s": "N m", "I": "A"}
+    units = {"reference": "N m" if inner else unit, "tau_s": "N m", "I": "A"}
     if position:
         columns, units = columns | {"theta_l": rows[:, 3]}, units | {"theta_l": "rad"}
     return so.Log.from_arrays(time=T * np.arange(len(rows)), units=units, source="knee", **columns)
 
 
 GOAL = 0.1 * np.sin(2.0 * np.pi * np.arange(4000) * T) + 0.05 * (np.arange(4000) // 1000 % 2)
+FORCE = 20.0 * GOAL  # N m
 
 
 @pytest.mark.parametrize("first", [0, 777])
@@ -89,3 +101,34 @@ def test_another_outer_loop_is_named(impedance, changes, what, value):
 def test_without_the_links_position_it_says_what_to_log(impedance):
     with pytest.raises(so.SeaoptError, match="log in each tick tau_s and theta_l"):
         so.accept(impedance, [make_log(run(impedance, GOAL[:500]), position=False)])
+
+
+def test_damping_alone_is_replayed_of_the_force_before_it_and_after(damping):
+    """The force that is asked for is what the test adds its own damping to; `step` is given the sum."""
+    rows = run(damping, FORCE, stiffness=0.0)
+    assert np.std(rows[:, 1] - rows[:, 0]) > 0.1 * np.std(rows[:, 0])
+    before, after = make_log(rows, unit="N m"), make_log(rows, inner=True, position=False)
+    result = so.accept(damping, [before, after, make_log(rows, inner=True)])
+    for row in result.replays:
+        assert row.met and row.mismatch < 1e-3 * row.rms, row
+    assert len(result.experiments) == 2  # before the damping it is another plant
+
+
+def test_another_damping_alone_is_named(damping):
+    (row,) = so.accept(damping, [make_log(run(damping, FORCE, stiffness=0.0, damping=0.5), unit="N m")]).replays
+    cause = row.causes[0]
+    assert not row.met and cause.explains and cause.what == "damping" and np.isclose(cause.value, 0.5, rtol=1e-3), row
+
+
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [
+        ("impedance", "log its x_0 as the reference, with the link's position"),
+        ("damping", "log what step was given as the reference; or, with the link's position, the force"),
+    ],
+)
+def test_the_page_of_a_bring_up_says_what_to_log(law, words, request):
+    law = request.getfixturevalue(law)
+    plants = {"stand": law.design[0], "knee": so.plants.rotary()}
+    plan = so.bring_up(law, plants, law.design[1], samples=2, fractions=(), limits={"tau_s": 40.0})
+    assert words in " ".join(repr(plan).split())
