@@ -7,10 +7,12 @@ from dataclasses import replace
 import pytest
 
 import seaopt as so
+from seaopt.control import CompensateGravity, add_compensation
 from seaopt.control.laws.verdict import advise_easing
 from seaopt.reporting.sections.data import Commands
 from seaopt.reporting.sections.kinds import controller as controllers
-from seaopt.reporting.sections.kinds.certificate import advise, judge
+from seaopt.reporting.sections.kinds.certificate import REMEDIES, advise, judge
+from seaopt.robustness import JointTuning
 from seaopt.robustness.certificate.requirement import Requirement
 from seaopt.robustness.certificate.simulated import STEPS
 from tests.checks import leave_out
@@ -41,6 +43,29 @@ def test_to_tune_for_a_plant_is_advised_only_where_that_is_possible(stand, thor)
     assert "robust_to" not in advise(row, controller, models={"stand": stand})  # the design plant by its name
     by_hand = so.assess(controller.law, stand, thor, SPEC)
     assert "robust_to" not in advise(row, by_hand, models={"stand": other})  # which nothing tunes
+
+
+def test_a_weight_that_the_tuner_does_not_see_is_compensated_less():
+    knee, held = so.plants.rotary("pendulum"), so.plants.rotary("locked")
+    values = knee.defaults.update(
+        N=100.0, K_tau=0.0369, eta=0.7, J_m=2.4e-5, b_r=1e-4, k_s=300.0, J_l=0.25, d_l=0.3, m=3.0, L=0.25, f_c=0.0
+    )
+    spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6)
+    law = so.tune(held, values, spec, robust_to={"knee": knee})
+
+    def certify(fraction):
+        carrying = add_compensation(law, gravity=CompensateGravity(fraction=fraction), link=(knee, values))
+        return so.certify(carrying, {"knee": knee}, values, ranges={"m": (2.8, 3.2)}, samples=20, simulations=False)
+
+    refused = certify(0.95)
+    verdict = judge(refused, Commands())
+    assert verdict.next[0].startswith(REMEDIES["gravity_compensation"])
+    assert not any("retune" in text or "robust_to" in text for text in (*verdict.next, *map(str, verdict.reasons)))
+    drawn = tuple(row for row in refused.requirements if row.name != "gravity_compensation")
+    assert judge(replace(refused, requirements=drawn), Commands()).next[0] == verdict.next[0]  # by the worst plant
+    rounds = JointTuning(status="rounds", controller=law, certificate=refused, rounds=(), robust_to={})
+    assert "more rounds" not in rounds.explanation and "smaller fraction" in rounds.explanation
+    assert certify(0.85).met
 
 
 def test_only_a_limit_that_binds_is_eased(stand, thor):

@@ -18,7 +18,7 @@ from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.law import describe_integrators
-from seaopt.control.running.fed_back import split_states
+from seaopt.control.running.fed_back import WEIGHT, split_states
 from seaopt.errors import ControlError
 from seaopt.estimation import warn_unidentified
 from seaopt.files import seal
@@ -30,7 +30,7 @@ from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.bounds.stretch import StretchBound
 from seaopt.robustness.certificate.cases import pose
-from seaopt.robustness.certificate.compensation import describe_compensation, list_compensation
+from seaopt.robustness.certificate.compensation import GRAVITY_COMPENSATION, describe_compensation, list_compensation
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import MarginDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
@@ -178,6 +178,14 @@ class Certificate(Result, Worded):
     def met(self) -> bool:
         """Whether every requirement is met."""
         return all(row.met for row in self.requirements)
+
+    @property
+    def fails_by_weight(self) -> bool:
+        """Whether what is compensated of a weight fails, which no tuning mends: its loops are without it."""
+        broken = {row.name for row in self.requirements if not row.met}
+        if GRAVITY_COMPENSATION in broken or not broken & {"monte_carlo_failures", "worst_case"}:
+            return GRAVITY_COMPENSATION in broken
+        return WEIGHT in max(self.worst.values(), key=lambda case: case.severity)[0].outputs
 
     @property
     def values(self) -> tuple[float, ...]:

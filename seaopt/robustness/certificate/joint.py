@@ -111,7 +111,8 @@ class JointTuning(Result):
             return law.explanation if isinstance(law, Controller) else law.remedy
         broken = next(row for row in self.certificate.requirements if not row.met)
         if self.status == "rounds":
-            return f"{len(self.rounds)} rounds were too few: {broken}; give more rounds, or a larger reserve"
+            more = "" if self.certificate.fails_by_weight else "; give more rounds, or a larger reserve"
+            return f"{len(self.rounds)} rounds were too few: {broken}{more}"
         return f"no witness is left that the tuner has not met: {broken}"
 
     @property

@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Bool, Float
 
+from seaopt.control.running.fed_back import WEIGHT
 from seaopt.executors import Shared, map_ordered
 from seaopt.progress import Progress, divide
 from seaopt.records import record
@@ -35,6 +36,7 @@ WORST_KEPT = 64  # worst draws kept of each plant
 DRAWS_PER_PART = 4  # of those that are judged one by one
 DRAW, SEARCH, BOUND = 1.5e-4, 0.3, 0.4  # seconds that each draw, search and bound of a plant takes as a rule
 WITNESS_REMEDY = "tune with that plant in robust_to, a larger reserve or a lower bandwidth"
+WEIGHT_REMEDY = "compensate a smaller fraction of gravity, or add an impedance: the tuner's loops are without a weight"
 
 Case = TypeVar("Case")
 
@@ -204,7 +206,7 @@ def draw_requirements(
             0.0,
             draw=DrawnAt(parameters=case.parameters),
             text=f"the worst case {size}",
-            remedy=WITNESS_REMEDY if result.failures else "",
+            remedy=_advise_worst(case) if result.failures else "",
             **spot._asdict(),
         )
     ]
@@ -227,6 +229,11 @@ def _require_bound(result: MonteCarlo, limit: float | None) -> list[Requirement]
     return [require_at_most("max_failure_probability", value, limit, text=text, remedy=remedy)]
 
 
+def _advise_worst(case: Worst) -> str:
+    """Return what to do about a worst case."""
+    return WEIGHT_REMEDY if WEIGHT in case[0].outputs else WITNESS_REMEDY
+
+
 def _require_worst(spot: Spot, case: Worst) -> Requirement:
     """Return how much of the limits the worst case uses: 1 is all of it."""
     unstable = case.severity >= UNSTABLE
@@ -238,4 +245,4 @@ def _require_worst(spot: Spot, case: Worst) -> Requirement:
         text=UNSTABLE_LOOP if unstable else "",
         **spot._asdict(),
     )
-    return row if row.met else replace(row, remedy=WITNESS_REMEDY)
+    return row if row.met else replace(row, remedy=_advise_worst(case))

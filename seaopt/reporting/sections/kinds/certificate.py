@@ -26,6 +26,7 @@ from seaopt.reporting.sections.kinds.simulated import list_left_out, summarise_f
 from seaopt.reporting.sections.kinds.verification import describe_steps
 from seaopt.robustness import Certificate
 from seaopt.robustness.certificate.certificate import NO_MODEL
+from seaopt.robustness.certificate.compensation import GRAVITY_COMPENSATION
 from seaopt.robustness.certificate.requirement import DESIGN_PLANT, Failure, Requirement, group_failures
 from seaopt.robustness.certificate.scheduled import name_rate_unit
 from seaopt.robustness.uncertainty.draws import Plants
@@ -44,7 +45,7 @@ REMEDIES = {
     "impedance_rest": "less stiffness, or more damping, in [impedance]",
     "impedance_draws": "less stiffness, or more damping, in [impedance]",
     "impedance_damper": "other stiffness, damping or velocity_filter_s in [impedance], inside the region of the report",
-    "gravity_compensation": "a smaller fraction of gravity in compensate of [controller], or an [impedance]",
+    GRAVITY_COMPENSATION: "a smaller fraction of gravity in compensate of [controller], or an [impedance]",
     "ripple_compensation": "a smaller fraction of ripple, or fewer of its cycles, in compensate of [controller]",
     "friction_compensation": 'from = "reference", a larger speed or a smaller fraction in compensate of [controller]',
     "constrained_failure_probability": "more constrained_runs in [robustness]",
@@ -85,6 +86,8 @@ def judge(certificate: Certificate, commands: Commands) -> Verdict:
     controller, models = certificate.controller, certificate.models
     reasons = [explain_failure(failure, controller, models=models) for failure in failures]
     remedies = [advise(failure.worst, controller, models=models) for failure in failures]
+    if certificate.fails_by_weight:
+        remedies = [REMEDIES[GRAVITY_COMPENSATION]]
     if certificate.constrained is not None:
         remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]
     first = next((text for text in remedies if text), "")
@@ -115,6 +118,8 @@ def _judge_schedule(certificate: Certificate, schedule: ScheduledController, com
     laws, models = schedule.controllers, certificate.models
     command = f"type {commands.certify}" if commands.certify else "tune again"
     remedies = (row.remedy or advise(row, *laws, models=models) for row in broken)
+    if certificate.fails_by_weight:
+        remedies = iter([REMEDIES[GRAVITY_COMPENSATION]])
     change = next((text for text in remedies if text), "raise reserve, or add points")
     return Verdict(
         met=False,
