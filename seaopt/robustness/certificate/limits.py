@@ -21,6 +21,7 @@ from seaopt.control.running.fed_back import close_terms
 from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError
 from seaopt.estimation import Experiment, Fit
+from seaopt.formatting import format_band
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -37,7 +38,7 @@ from seaopt.robustness.certificate.requirement import (
     Spot,
     require_at_most,
 )
-from seaopt.robustness.uncertainty.logs import GRACE, judge_log
+from seaopt.robustness.uncertainty.logs import GRACE, LogVerdict, judge_log
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES
@@ -138,7 +139,7 @@ def judge_logs(survey: Survey, _: Progress) -> Evidence:
             each.ms_least,
             limit * (1.0 + GRACE),
             plant=f"log:{each.experiment}",
-            text=f"{each.samples}, {each.outcome} at {each.ms_hz:.3g} Hz, predicted {each.ms_predicted:.3g}",
+            text=describe_log(each),
         )
         for each in verdicts
     )
@@ -146,6 +147,17 @@ def judge_logs(survey: Survey, _: Progress) -> Evidence:
     if fit.experiments and not logs and survey.place is None:
         remarks.append(NO_LOG)
     return Evidence(requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remarks))
+
+
+def describe_log(log: LogVerdict) -> str:
+    """Return what a log says of the loop, up to which frequency and how surely, for its row."""
+    measured = "UNSTABLE" if np.isinf(log.ms) else f"Ms {log.ms:.3g}"
+    alone = f", at its amplitude of {log.amplitude:.3g} {log.unit} rms" if log.at_amplitude else ""
+    sure = "not independent" if log.confidence is None else f"at {100 * log.confidence:g} %"
+    return (
+        f"{log.samples}, {log.outcome} at {log.ms_hz:.3g} Hz: measured {measured}, predicted {log.ms_predicted:.3g}; "
+        f"it tells from {format_band(log.band_hz)} Hz{alone}; {sure}"
+    )
 
 
 def _find_log_place(over: str, fit: Fit, experiment: Experiment) -> float:

@@ -13,7 +13,7 @@ from seaopt.bench import Sensors
 from seaopt.codec import from_content, join_schemas
 from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
-from seaopt.control.running.fed_back import close_terms, split_states
+from seaopt.control.running.fed_back import AGAINST, WEIGHT, close_terms, split_states
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_schema, check_seal, plain
 from seaopt.parameters import ParameterSet
@@ -25,6 +25,7 @@ from seaopt.robustness.certificate.cases import Cases
 from seaopt.robustness.certificate.certificate import NO_MODEL, ROBUSTNESS_SCHEMA, Certificate
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
+    WITH_TERMS,
     find_nominal_compensation,
 )
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
@@ -148,15 +149,23 @@ def robustness_schema() -> dict[str, Any]:
     return join_schemas(StoredCertificate, StoredScheduleCertificate)
 
 
-def check_file(content: Mapping[str, Any]) -> None:
-    """Refuse a certificate of another version, and one that was edited or written by hand (FileError)."""
+def check_file(content: Mapping[str, Any], *, of_schedule: bool) -> None:
+    """Refuse a certificate of another version or of another kind of law, and one that was edited or written by hand
+    (FileError).
+    """
     check_schema(content, ROBUSTNESS_SCHEMA, FILE, CERTIFY_AGAIN)
     check_seal(content, FILE, CERTIFY_AGAIN)
+    if (content.get("schedule") is not None) is not of_schedule:
+        kinds = ("one law", "a schedule")
+        raise FileError(
+            f"{FILE}: is of {kinds[not of_schedule]}, and law is {kinds[of_schedule]}; give the law that it is of, or "
+            f"{CERTIFY_AGAIN}"
+        )
 
 
 def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
     """Return what a certificate needs of a robustness.json; one that was edited or written by hand is refused."""
-    check_file(content)
+    check_file(content, of_schedule=False)
     return from_content(StoredCertificate, content, FILE, remedy=CERTIFY_AGAIN)
 
 
@@ -167,7 +176,7 @@ def build_certificate(
     if isinstance(law, Controller):
         (cases,) = posed.values()
         return _build_one(read_certificate(content), content, cases, None)
-    check_file(content)
+    check_file(content, of_schedule=True)
     stored = from_content(StoredScheduleCertificate, content, FILE, remedy=CERTIFY_AGAIN)
     found = stored.schedule
     if len(found.places) != len(posed):
@@ -209,8 +218,13 @@ def _build_one(
         if name not in plants:
             raise FileError(f'{FILE}: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
     impedance = stored.impedance or StoredImpedance()
+    linear = {name: plants[name] for name in stored.plants}
+    if WITH_TERMS not in stored.remarks and any({WEIGHT, AGAINST} & each.outputs.keys() for each in linear.values()):
+        raise FileError(
+            f"{FILE}: is of an older seaopt, whose figures leave out what the law's compensation feeds back; "
+            f"{CERTIFY_AGAIN}"
+        )
     try:
-        linear = {name: plants[name] for name in stored.plants}
         worst = {name: content["plants"][name]["worst"] for name in linear}
         certificate = Certificate(
             requirements=read_requirements(content),
