@@ -7,14 +7,16 @@ the values (`second_log`). It has to be narrow enough to design with, and the lo
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from seaopt.estimation.judgement.second_log import FAR, SECOND, find_excess, has_two_amplitudes
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.residual_statistics import compute_residuals
 from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.findings import FitFinding
-from seaopt.estimation.result.fit_result import Fit
+from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError
 from seaopt.estimation.solver.step_size import STEP_ERROR_PARAMETER, STEP_ERROR_SIGMA
 from seaopt.parameters import QUANTILE, Parameter
@@ -27,6 +29,7 @@ UNSEEN = 0.02  # of an output's spread: what may be zero is known well enough wh
 BLOCKS, EVENT = 64, 0.1  # of a log: in so many blocks an input moves or rests; and the longest event, as a share
 MOVES = 0.01  # of the block in which an input moves the most
 LOUD = 6.0  # standard deviations of a reading's noise in a block, above which it moves
+FOLLOWED = 30.0  # standard deviations by which the outputs follow what is small: a tenth off is three of them off
 READING = 0.05  # of a constant, up to which what is white about it is a reading's noise
 
 
@@ -113,15 +116,18 @@ def _list_effects(fit: Fit) -> set[str]:
     }
 
 
-def find_single_event(experiments: Sequence[Experiment]) -> Iterator[FitFinding]:
+def find_single_event(experiments: Sequence[Experiment], minimum: Minimum | None = None) -> Iterator[FitFinding]:
     """Yield that one step is all that happens to every plant, in one log or in several alike: any model follows it with
-    some values, which nothing refutes. Logs that are too short to tell are no evidence.
+    some values, which nothing refutes. Logs that are too short to tell are no evidence. What an input does before and
+    after its step is a reading's noise, unless the outputs of the `minimum` follow it.
     """
     sizes: dict[str, list[list[float] | None]] = {}
     for experiment in experiments:
         if experiment.log.time.size > 2 * BLOCKS:
             sizes.setdefault(experiment.plant.name, []).append(_measure_event(experiment))
     if not sizes or not all(map(_are_alike, sizes.values())):
+        return
+    if minimum is not None and _follows_small(minimum):
         return
     yield FitFinding(
         severity="error",
@@ -155,14 +161,15 @@ def _measure_event(experiment: Experiment) -> list[float] | None:
         if noise <= READING * abs(middle) and np.var(steps) >= noise**2:  # a reading that is white about a constant
             sizes.append(abs(middle))
             continue
-        if _measure_activity(values) > EVENT:
+        first, last = _find_moves(values)
+        if last - first > EVENT * BLOCKS:
             return None
         sizes.append(float(np.ptp(values)))
     return sizes
 
 
-def _measure_activity(values: Signal) -> float:
-    """Return which part of a log an input moves in, from its first move to its last; 0 where it never moves."""
+def _find_moves(values: Signal) -> tuple[int, int]:
+    """Return the blocks from an input's first move to its last, which is left out; none where it never moves."""
     blocks = np.array_split(values, BLOCKS)
     power = np.array([float(np.sum(block**2)) for block in np.array_split(np.diff(values), BLOCKS)])
     rest, largest = float(np.median(power)), float(np.ptp(values))
@@ -176,4 +183,34 @@ def _measure_activity(values: Signal) -> float:
         moves &= power > LOUD * spread
         moves |= np.abs(means) > max(LOUD * np.sqrt(square / blocks[0].size), MOVES**0.5 * np.max(np.abs(means)))
     moving = np.flatnonzero(moves)
-    return (int(moving[-1]) - int(moving[0]) + 1) / BLOCKS if moving.size and largest > 0.0 else 0.0
+    return (int(moving[0]), int(moving[-1]) + 1) if moving.size and largest > 0.0 else (0, 0)
+
+
+def _follows_small(minimum: Minimum) -> bool:
+    """Tell whether outputs follow what inputs do while they rest: whether residuals grow where that is left out."""
+    problem, z = minimum.problem, minimum.z
+    flat = {each.name: _flatten(each.data) for each in problem.experiments}
+    without = compute_residuals(*problem.rebuild(problem.params, z, flat))
+    gain = 0.0
+    for name, residuals in minimum.residuals().items():
+        before, after = (np.sum(each.weighted**2, axis=0) for each in (residuals, without[name]))
+        counts = np.count_nonzero(residuals.weighted, axis=0)
+        gain += float(np.sum((after - before) * counts / np.maximum(before, 1e-300)))
+    return gain > FOLLOWED**2
+
+
+def _flatten(experiment: Experiment) -> Experiment:
+    """Return an experiment whose inputs are constant before their moves, and after."""
+    plant, log = experiment.plant, experiment.log
+    values = {name: log[name] for name in log.signals}
+    for name, column in zip(plant.inputs, input_samples(plant, log), strict=True):
+        if name not in values or name == plant.clock:
+            continue
+        rows = np.array_split(np.arange(column.size), BLOCKS)
+        first, last = _find_moves(column)
+        flat = column.copy()
+        for rest in (rows[:first], rows[last:]):
+            if rest:
+                flat[np.concatenate(rest)] = np.mean(column[np.concatenate(rest)])
+        values[name] = flat
+    return replace(experiment, log=log.with_values(log.time, values, "inputs at rest are constant"))

@@ -109,7 +109,7 @@ def judge(
         *_find_noiseless(fit, minimum),
         *find_excesses(fit),
         *find_rough(fit, error),
-        *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each)))),
+        *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each))), minimum),
         *find_other_minimum(fit),
     ]
     suspects = {name: test for name, test in _run_tests(fit, minimum).items() if test.p < DOUBTFUL}

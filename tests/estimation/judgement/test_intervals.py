@@ -188,6 +188,29 @@ def test_one_step_stays_one_in_a_reading_with_noise(rise, noise):
     assert not list(find_single_event([log(0.0 * step + reading)]))  # noise that is the input
 
 
+@pytest.mark.parametrize(("small", "follows"), [("dither", True), ("chirp", True), ("reading", False)])
+def test_what_the_outputs_follow_is_no_noise_of_a_reading(small, follows):
+    """A first-order lag of the test's own, driven by a step with a small part, or read with it."""
+    time, rng = np.arange(5000) / 500, np.random.default_rng(3)
+    white = 0.03 * rng.normal(size=time.size)
+    chirp = 0.1 * np.sin(2.0 * np.pi * (0.2 + 0.05 * time) * time)
+    part = chirp if small == "chirp" else white
+    step = (time > 1.0).astype(float)
+    commanded = step + part * (time > 1.0) if follows else step
+    lag = np.exp(-1.0 / 500 / 0.05)
+    y = lfilter([0.0, 2.0 * (1.0 - lag)], [1.0, -lag], commanded) + 0.01 * rng.normal(size=time.size)
+    plant = so.Plant(
+        name="lag", states={"z": "-"}, inputs={"u": "-"}, outputs={"y": "-"}, parameters={"a": "-", "T": "s"},
+        f=lambda t, x, u, p: {"z": (p.a * u.u - x.z) / p.T}, h=lambda t, x, u, p: {"y": x.z},
+    )  # fmt: skip
+    log = so.Log.from_arrays(time=time, u=commanded if follows else step + white, y=y)
+    bench = so.Experiment(plant=plant, log=log, initial_state="rest", offset=False)
+    start = so.ParameterSet.of(a=(1.8, "-"), T=(0.06, "s")).free("a", "T")
+    result = so.fit([bench], start, method=so.OutputError(search=False))
+    assert ("event" in list_kinds(result, "error")) is not follows
+    assert [each.kind for each in find_single_event([bench])] == ["event"]
+
+
 def test_steps_of_one_size_are_no_evidence_however_many_logs_have_one():
     """A motor whose dry friction the model lacks: without a residual its inertia comes out 43 % too large."""
     motor = so.Plant(
