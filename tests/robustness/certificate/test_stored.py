@@ -1,51 +1,63 @@
-"""What the row of a log says, and which files of certificates are refused."""
+"""What a robustness.json may hold, and how a mistake in one is named."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import copy
 
 import numpy as np
 import pytest
 
-import seaopt as so
-from seaopt.control import CompensateGravity, add_compensation
 from seaopt.errors import FileError
 from seaopt.files import seal
-from seaopt.robustness.certificate.compensation import WITH_TERMS
-from seaopt.robustness.certificate.limits import describe_log
-from seaopt.robustness.certificate.simulated import STEPS
-from seaopt.robustness.uncertainty.logs import LogVerdict
-from tests.checks import leave_out
+from seaopt.robustness.certificate.stored import read_certificate
 
-FITTED = LogVerdict(
-    experiment="chirp", samples="fitted", outcome="undecided", band_hz=(0.8, 151.0), ms=1.7, ms_hz=54.5, ms_least=1.6,
-    ms_predicted=1.59, confidence=None, amplitude=1.49, unit="A", at_amplitude=False,
-)  # fmt: skip
-
-
-def test_the_row_of_a_log_says_how_surely_and_where_it_tells():
-    said = "fitted, undecided at 54.5 Hz: measured Ms 1.7, predicted 1.59; it tells from 0.8 to 151 Hz"
-    assert describe_log(FITTED) == f"{said}; not independent"
-    rubbing = replace(FITTED, at_amplitude=True)
-    assert describe_log(rubbing) == f"{said}, at its amplitude of 1.49 A rms; not independent"
-    held = describe_log(replace(FITTED, samples="held out", outcome="confirmed", confidence=0.95))
-    assert held.startswith("held out, confirmed at 54.5 Hz: ") and held.endswith("to 151 Hz; at 95 %")
-    assert ": measured UNSTABLE, predicted" in describe_log(replace(FITTED, outcome="refuted", ms=np.inf))
+CONTENT = {
+    "schema": "seaopt/robustness/3", "passed": True,
+    "requirements": [{"name": "max_sensitivity", "limit": 1.6, "value": None, "met": False, "where": "stand"}],
+    "plants": {
+        "stand": {"ms": 1.5, "worst": {"parameters": {}}},
+        "swing": {"worst": {"parameters": {"I_p": 0.2}, "ms_lower": 1.5, "ms_upper": None, "mt_lower": 1.2,
+                            "mt_upper": None, "bounded_stable": False, "boxes": 7}},
+    },
+    "monte_carlo": {"samples": 50, "failures": 0, "seed": 1, "failure_probability_bound": 0.2, "confidence": 0.999999},
+    "varied": [{"name": "J", "unit": "kg m^2", "value": 3e-6, "std": 1e-9, "low": None, "high": None}],
+    "simulation": None,
+}  # fmt: skip
 
 
-def test_files_without_what_a_law_feeds_back_or_of_another_kind_are_refused(monkeypatch):
-    leave_out(monkeypatch, STEPS)
-    held, knee = so.plants.rotary("locked"), so.plants.rotary("pendulum")
-    values = knee.defaults.update(
-        N=100.0, K_tau=0.0369, eta=0.7, J_m=2.4e-5, b_r=1e-4, k_s=300.0, J_l=0.25, d_l=0.3, m=3.0, L=0.25, f_c=0.0
-    )
-    plain = so.tune(held, values, so.ControllerSpec(measured="tau_s", bandwidth_hz=15, reserve=0.05))
-    law = add_compensation(plain, gravity=CompensateGravity(fraction=0.9), link=(knee, values))
-    content = so.certify(law, {"knee": knee}, values, samples=2, simulations=False).to_dict()
-    assert so.Certificate.from_dict(content, law, {"knee": knee}, values).plants
-    older = content | {"remarks": [text for text in content["remarks"] if text != WITH_TERMS]}
-    with pytest.raises(FileError, match=r"leave out what the law's compensation feeds back; certify again"):
-        so.Certificate.from_dict(seal(older), law, {"knee": knee}, values)
-    scheduled = seal(content | {"schedule": {"over": "m"}})
-    with pytest.raises(FileError, match=r"is of a schedule, and law is one law; give the law that it is of"):
-        so.Certificate.from_dict(scheduled, law, {"knee": knee}, values)
+def test_null_is_infinite():
+    stored = read_certificate(seal(CONTENT))
+    assert stored.requirements[0].value == np.inf
+    assert (stored.varied[0].low, stored.varied[0].high) == (-np.inf, np.inf)
+    assert stored.plants["swing"].worst.parameters == {"I_p": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "words"),
+    [
+        (("monte_carlo", "failures"), "none", "monte_carlo.failures = 'none': should be a valid integer"),
+        (("monte_carlo", "seed"), ..., "key monte_carlo.seed is missing"),
+        (("plants", "swing", "worst", "parameters", "I_p"), "x", "plants.swing.worst.parameters.I_p = 'x'"),
+        (("requirements", 0, "met"), 1, "requirements.1.met = 1: should be a valid boolean"),
+        (("simulation",), {"seed": 1}, "key simulation.sensors is missing"),
+    ],
+)
+def test_a_mistake_is_one_line_with_place_value_and_remedy(keys, value, words):
+    content = copy.deepcopy(CONTENT)
+    table = content
+    for key in keys[:-1]:
+        table = table[key]
+    if value is ...:
+        del table[keys[-1]]
+    else:
+        table[keys[-1]] = value
+    with pytest.raises(FileError) as raised:
+        read_certificate(seal(content))
+    message = str(raised.value)
+    assert message.startswith("robustness.json: ") and words in message
+    assert message.endswith("; certify again") and "\n" not in message
+
+
+def test_a_file_of_an_older_version_is_refused_with_what_to_do():
+    with pytest.raises(FileError, match=r'"seaopt/robustness/3"; certify again'):
+        read_certificate(seal(CONTENT | {"schema": "seaopt/robustness/2"}))
