@@ -100,7 +100,7 @@ def test_mode_that_the_model_lacks_fails_by_the_name_of_the_log(stand, thor, fit
     assert not row.met and not certificate.met
     assert row.plant == "log:chirp1" and row.limit == pytest.approx(1.6 * (1 + GRACE))
     assert verdict.outcome == "refuted" and 38.0 < verdict.ms_hz < 46.0
-    assert "log:chirp1: fitted, refuted at" in row.where and "predicted" in row.where
+    assert "log:chirp1: fitted, refuted at" in row.where and f"measured Ms {verdict.ms:.3g}, pred" in row.where
     f = np.linspace(38.0, 46.0, 2000)
     peak = np.max(sensitivity(controller, thor, 0.05, f))
     assert verdict.ms_least < peak
@@ -122,6 +122,9 @@ def test_right_model_passes_and_fitted_samples_confirm_nothing(stand, controller
     assert all(row.met for row in rows_of(certificate)) and len(rows_of(certificate)) == 3
     assert (fitted.experiment, fitted.samples, fitted.outcome) == ("chirp1", "fitted", "undecided")
     assert fitted.confidence is None
+    first, held, last = (row.where for row in rows_of(certificate))
+    assert "tells from" in first and first.endswith("; not independent")
+    assert held.endswith("; at 95 %") and last.endswith("; at 95 %") and "validate, confirmed at" in last
     assert fitted.band_hz[0] < 2.0 and fitted.band_hz[1] > 100.0
     assert (held_out.experiment, held_out.samples) == ("chirp1", "held out")
     assert (other.experiment, other.samples, other.outcome) == ("other2", "validate", "confirmed")
