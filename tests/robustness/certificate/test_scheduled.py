@@ -65,7 +65,7 @@ def test_what_is_of_one_law_is_drawn_at_a_place_alone(certificate):
     place = certificate.places[-1]
     drawn = {line.get_label(): line.get_ydata() for line in place.plot.sensitivity().lines}
     assert 10.0 ** (np.max(drawn["swing"]) / 20.0) == pytest.approx(place.plants["swing"].ms, rel=1e-4)
-    law = replace(certificate.controller, robust_to={})
+    law = replace(certificate.controller, robust_to=())
     plates = {plate.name: plate for plate in _list_plates(_sort_results([law, certificate]))}
     assert {*plates} == {"loop", "schedule"} and not plates["loop"].heading  # of the law on its design plant
 
