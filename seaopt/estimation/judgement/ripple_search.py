@@ -60,7 +60,8 @@ def find_ripple(
     top = min(2.0 * np.pi * TURNS / max(float(np.quantile(moved, SLOW)), 1e-300), MOST * step)
     residual = load_fft().rfft(raw / size[:, None])
     gain = _respond(experiment.data.plant, params, experiment.data.outputs, experiment.period, position.size)
-    own = np.stack([np.convolve(row, np.full(NEARBY, 1.0 / NEARBY), "same") for row in np.abs(residual) ** 2])
+    nearby = min(NEARBY, residual.shape[1])
+    own = np.stack([np.convolve(row, np.full(nearby, 1.0 / nearby), "same") for row in np.abs(residual) ** 2])
     own = np.sqrt(np.maximum(own, 1e-300))
     residual, gain = residual / own, gain / size[:, None] / own
 
