@@ -41,6 +41,11 @@ def test_what_the_page_refuses_is_refused_for_that_reason(tmp_path):
     assert found == [reason for *_, reason in cells]
 
 
+def test_a_schedule_whose_link_is_fed_forward_is_certified(tmp_path):
+    """The link is that of a plant it was tuned on besides: once its certificate left those out, and was refused."""
+    assert not combinations.try_combination("schedule of `pid`", "`link_feedforward`", tmp_path)
+
+
 @pytest.mark.slow
 def test_the_page_is_what_one_run_writes():
     assert combinations.write_page() == combinations.PAGE.read_text(encoding="utf-8")
