@@ -191,7 +191,7 @@ def pose(
         raise ControlError(
             f"{over} is estimated by the fit, and the schedule is over it; fix it in the experiments that are fitted"
         )
-    # What it was tuned on besides is judged by the checks, with all other plants; a feedforward has its link from there.
+    # What it was tuned on besides is judged by the checks, with all other plants; a feedforward finds its link there.
     alone = law if law.spec.link_feedforward else replace(law, others={})
     for value in sorted({*law.points, *list_inner(law.points, PARTS)}):
         variable, source, other = Parameter(name=over, value=value, unit=law.unit), parameters, others
