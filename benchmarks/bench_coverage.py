@@ -40,7 +40,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost these small problems more than they bring
@@ -57,7 +57,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent / "truth"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "problems"))
 import actuators
 import elastic_joint
-from run import summarise
+from run import list_free, pose, summarise
 
 FREE = ("J", "b_r", "eta")
 RATE_HZ = 400.0
@@ -154,7 +154,7 @@ def play(kind: str, link: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     return current, actuator.simulate(current)
 
 
-def sticking(actuator: actuators.Actuator, base: so.Plant, free: Sequence[str], seed: int) -> so.Fit:
+def sticking(actuator: actuators.Actuator, seed: int) -> so.Fit:
     current, ideal = play(actuator.kind, actuator.link)
     rng = np.random.default_rng([seed, 3])
     readings = {name: values + NOISE.get(name, 0.0) * rng.normal(size=values.size) for name, values in ideal.items()}
@@ -162,19 +162,9 @@ def sticking(actuator: actuators.Actuator, base: so.Plant, free: Sequence[str], 
         step = STEP[name]
         readings[name] = step * np.round(readings[name] / step + rng.uniform())
     log = so.Log.from_arrays(time=np.arange(current.size) / actuators.RATE_HZ, I=current, **readings)
-    plant = so.plants.let_stick(base)
-    known = {name: value for name, value in actuator.truth.items() if name in plant.parameters}
-    params = plant.defaults.update(**known | {name: 1.1 * known[name] for name in free}).free(*free)
-    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
+    plant, params, delay = pose(actuator, actuator.truth)
+    params = params.update(**{name: 1.1 * params[name].value for name in list_free(actuator)})
     return so.fit([so.Experiment(plant=plant, log=log, outputs=tuple(ideal), delay_s=delay)], params)
-
-
-def screw(seed: int) -> so.Fit:
-    return sticking(SCREW, STAND, tuple(CASES["friction"].truth), seed)
-
-
-def knee(seed: int) -> so.Fit:
-    return sticking(KNEE, so.plants.rotary(link="pendulum"), tuple(CASES["rotary with encoders"].truth), seed)
 
 
 @cache
@@ -208,8 +198,8 @@ CASES = {
     "coloured noise, chirp": Case(fit=coloured_chirp, truth=OF_STAND),
     "80 Hz mode, all frequencies": Case(fit=mode, truth=OF_STAND),
     "80 Hz mode, 0 to 8 Hz": Case(fit=mode_in_band, truth=OF_STAND),
-    "friction": Case(fit=screw, truth=_choose(SCREW.truth, "J", "b_r", "k", "eta", "f_c")),
-    "rotary with encoders": Case(fit=knee, truth=_choose(KNEE.truth, "J_m", "b_r", "k_s", "eta", "f_c")),
+    "friction": Case(fit=partial(sticking, SCREW), truth=_choose(SCREW.truth, *list_free(SCREW))),
+    "rotary with encoders": Case(fit=partial(sticking, KNEE), truth=_choose(KNEE.truth, *list_free(KNEE))),
     "servo": Case(fit=servo, truth=_choose(elastic_joint.TRUTH, *elastic_joint.START)),
 }
 

@@ -36,43 +36,21 @@ QUANTILES = (0.025, 0.5, 0.975)
 NAMES = problem.NAMES[:4]  # of the plant; the offset and the start belong to the log
 
 
-def make_data(amplitude: float, seconds: float, seed: int = 1) -> dict[str, np.ndarray]:
-    """Return current, noisy force, and the Fisher information's centre and factor, which scale the sampler."""
-    t = np.arange(round(seconds * problem.RATE_HZ)) * problem.STEP_S
-    low, high = problem.CHIRP_HZ
-    scale = seconds / np.log(high / low)
-    current = amplitude * np.sin(2 * np.pi * low * scale * np.expm1(t / scale))
-    tiny, truth = 1e-30, problem.TRUTH
-    columns = problem.simulate(truth[:, None] + 1j * tiny * np.eye(truth.size), current)
-    jacobian = columns.imag / (tiny * problem.NOISE_N)
+def make_data(amplitude: float, seconds: float, seed: int = 1) -> tuple[problem.Data, np.ndarray]:
+    """Return the data of a case, and a factor of the Fisher information's inverse, which scales the sampler."""
+    current = problem.chirp(amplitude, round(seconds * problem.RATE_HZ))
+    truth, jacobian = problem.differentiate(current)
     covariance = np.linalg.inv(jacobian.T @ jacobian)
-    force = columns[:, 0].real + problem.NOISE_N * np.random.default_rng(seed).normal(size=t.size)
-    factor = np.linalg.cholesky(covariance)
-    return {"current": current, "force": force, "std": np.sqrt(np.diag(covariance)), "factor": factor}
+    force = truth + problem.NOISE_N * np.random.default_rng(seed).normal(size=current.size)
+    data = problem.Data(current=current, force=force, std=np.sqrt(np.diag(covariance)))
+    return data, np.linalg.cholesky(covariance)
 
 
-def fit_data(data: dict[str, np.ndarray]) -> tuple[so.Fit, np.ndarray]:
-    """Return the fit of a case, and all seven unknowns at its minimum."""
-    log = so.Log.from_arrays(time=np.arange(data["current"].size) * problem.STEP_S, i=data["current"], F=data["force"])
-    values = dict(zip(NAMES, problem.TRUTH, strict=False))
-    units = dict(zip(NAMES, problem.UNITS, strict=False))
-    guess = so.ParameterSet.of(
-        **{name: (values[name], units[name]) for name in NAMES}, k=(problem.K, "N/m"), v_s=(problem.V_S, "m/s")
-    ).free(*NAMES)
-    bounds = zip(problem.LOWER, problem.UPPER, strict=True)
-    guess = guess.bound(**dict(zip(NAMES, bounds, strict=False)))
-    experiment = so.Experiment(plant=peer_seaopt.plant(), log=log, sigma={"F": problem.NOISE_N})
-    fit = so.fit([experiment], guess)
-    own = fit.nuisance[experiment.name]
-    theta = [*(fit.parameters[name].value for name in NAMES), own.offset["F"], *own.initial_state[0].values()]
-    return fit, np.array(theta)
-
-
-def sample(data: dict[str, np.ndarray], center: np.ndarray, python: Path, draws: int) -> dict:
+def sample(data: problem.Data, center: np.ndarray, factor: np.ndarray, python: Path, draws: int) -> dict:
     """Return what NUTS says."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.npz"
-        np.savez(path, **data, center=center)
+        np.savez(path, current=data.current, force=data.force, std=data.std, center=center, factor=factor)
         command = [str(python), str(SAMPLER), str(path), "--draws", str(draws), "--quantiles"]
         done = subprocess.run([*command, *map(str, QUANTILES)], capture_output=True, text=True, check=False)
     if done.returncode:
@@ -82,9 +60,10 @@ def sample(data: dict[str, np.ndarray], center: np.ndarray, python: Path, draws:
 
 def compare(case: str, python: Path, draws: int) -> Iterator[str]:
     """Yield the lines of a case."""
-    data = make_data(*CASES[case])
-    fit, center = fit_data(data)
-    found = sample(data, center, python, draws)
+    data, factor = make_data(*CASES[case])
+    experiment, guess = peer_seaopt.pose(data)
+    fit = so.fit([experiment], guess)
+    found = sample(data, peer_seaopt.list_unknowns(fit), factor, python, draws)
     redrawn = so.bootstrap(fit, draws=2000, seed=1)
     yield f"## {case[0].upper()}{case[1:]}\n"
     yield f"Effective draws {found['effective']:.0f}, split R-hat {found['mixing']:.3f}; the fit is {fit.verdict}.\n"

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import casadi as ca
 import numpy as np
-from problem import LOWER, NAMES, NOISE_N, SAMPLES, START, STEP_S, UNITS, UPPER, V_S, Answer, Data, K, Settings, report
+from problem import LOWER, NAMES, NOISE_N, START, STEP_S, UNITS, UPPER, V_S, Answer, Data, K, Settings, report
 
 import seaopt as so
 
@@ -27,20 +27,31 @@ def plant() -> so.Plant:
     )
 
 
-def prepare(data: Data, settings: Settings) -> Callable[[], Answer]:
-    """State the problem; seaopt chooses its own steps and compiles in the first fit."""
-    log = so.Log.from_arrays(time=np.arange(SAMPLES) * STEP_S, i=data.current, F=data.force)
+def pose(data: Data) -> tuple[so.Experiment, so.ParameterSet]:
+    """Return the experiment, and where the search begins."""
+    log = so.Log.from_arrays(time=np.arange(data.current.size) * STEP_S, i=data.current, F=data.force)
     free = {name: (START[j], UNITS[j]) for j, name in enumerate(NAMES[:4])}
     guess = so.ParameterSet.of(**free, k=(K, "N/m"), v_s=(V_S, "m/s")).free(*free)
     guess = guess.bound(**{name: (LOWER[j], UPPER[j]) for j, name in enumerate(free)})
-    experiment = so.Experiment(plant=plant(), log=log, sigma={"F": NOISE_N})
+    return so.Experiment(plant=plant(), log=log, sigma={"F": NOISE_N}), guess
+
+
+def list_unknowns(fit: so.Fit) -> np.ndarray:
+    """Return all seven unknowns at a fit's minimum."""
+    (own,) = fit.nuisance.values()
+    values = (fit.parameters[name].value for name in NAMES[:4])
+    return np.array([*values, own.offset["F"], *own.initial_state[0].values()])
+
+
+def prepare(data: Data, settings: Settings) -> Callable[[], Answer]:
+    """State the problem; seaopt chooses its own steps and compiles in the first fit."""
+    experiment, guess = pose(data)
 
     def solve() -> Answer:
         fit = so.fit([experiment], guess)
         own = fit.nuisance[experiment.name]
-        theta = [*(fit.parameters[name].value for name in free), own.offset["F"], *own.initial_state[0].values()]
         note = f"{fit.status}; {own.substeps} steps a sample, error {fit.step_error_sigma:.3f} sigma"
-        return Answer(theta=np.array(theta), evaluations=fit.iterations, note=note)
+        return Answer(theta=list_unknowns(fit), evaluations=fit.iterations, note=note)
 
     return solve
 

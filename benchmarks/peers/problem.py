@@ -71,11 +71,11 @@ class Answer:
     note: str = ""
 
 
-def chirp() -> np.ndarray:
+def chirp(amplitude: float = AMPLITUDE_A, samples: int = SAMPLES) -> np.ndarray:
     """Return the current (A) at the samples."""
-    t, (low, high) = np.arange(SAMPLES) * STEP_S, CHIRP_HZ
-    scale = SAMPLES * STEP_S / np.log(high / low)
-    return AMPLITUDE_A * np.sin(2 * np.pi * low * scale * np.expm1(t / scale))
+    t, (low, high) = np.arange(samples) * STEP_S, CHIRP_HZ
+    scale = samples * STEP_S / np.log(high / low)
+    return amplitude * np.sin(2 * np.pi * low * scale * np.expm1(t / scale))
 
 
 def rates(x: np.ndarray, v: np.ndarray, u: float, theta: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -100,12 +100,17 @@ def simulate(theta: np.ndarray, current: np.ndarray, substeps: int = SUBSTEPS) -
     return force
 
 
+def differentiate(current: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true force, shape (n,), and its derivatives by the unknowns over the noise, (n, 7): complex steps."""
+    tiny = 1e-30
+    columns = simulate(TRUTH[:, None] + 1j * tiny * np.eye(TRUTH.size), current)
+    return columns[:, 0].real, columns.imag / (tiny * NOISE_N)
+
+
 def make(path: Path) -> None:
     """Write current, noisy force, noiseless force and the Fisher-information standard deviations to an .npz file."""
-    current, tiny = chirp(), 1e-30
-    columns = simulate(TRUTH[:, None] + 1j * tiny * np.eye(TRUTH.size), current)
-    truth = columns[:, 0].real
-    jacobian = columns.imag / (tiny * NOISE_N)
+    current = chirp()
+    truth, jacobian = differentiate(current)
     size = np.linalg.norm(jacobian, axis=0)
     scaled = jacobian / size
     std = np.sqrt(np.diag(np.linalg.inv(scaled.T @ scaled))) / size

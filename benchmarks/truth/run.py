@@ -62,15 +62,9 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
     import seaopt as so
     from seaopt.problem.explained import find_explanation
 
-    rng, kind = np.random.default_rng(seed), KINDS[actuator.kind]
-    base = so.plants.high_impedance() if kind.linear else so.plants.rotary(link=actuator.link)
-    plant = base if actuator.smooth else so.plants.let_stick(base)
-    truth = actuator.find_truth(seconds=seconds, seed=seed)
-    known = {name: value for name, value in truth.items() if name in plant.parameters}
-    free = tuple(name for name in FREE[kind.linear] if name != "f_c" or not actuator.smooth)
-    guess = {name: known[name] * 2.0 ** rng.uniform(-1, 1) for name in free}
-    params = plant.defaults.update(**known | guess).free(*free)
-    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
+    rng, known = np.random.default_rng(seed), actuator.find_truth(seconds=seconds, seed=seed)
+    (plant, params, delay), free = pose(actuator, known), list_free(actuator)
+    params = params.update(**{name: known[name] * 2.0 ** rng.uniform(-1, 1) for name in free})
 
     def record(k: int) -> so.Experiment:
         readings = actuator.record(seconds=seconds, amplitude=AMPLITUDES[k], seed=seed + SEEDS * k)
@@ -104,6 +98,24 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
         else:
             break
     return rounds[-1] | {"rounds": rounds, "cpu_s": round(sum(each["cpu_s"] for each in rounds), 2)}
+
+
+def pose(actuator: Actuator, known: Mapping[str, float]) -> tuple[Any, Any, Any]:
+    """Return the plant that is fitted to an actuator, its parameters at what is known, some free, and the delay."""
+    import seaopt as so
+
+    linear = KINDS[actuator.kind].linear
+    base = so.plants.high_impedance() if linear else so.plants.rotary(link=actuator.link)
+    plant = base if actuator.smooth else so.plants.let_stick(base)
+    values = {name: value for name, value in known.items() if name in plant.parameters}
+    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
+    return plant, plant.defaults.update(**values).free(*list_free(actuator)), delay
+
+
+def list_free(actuator: Actuator) -> tuple[str, ...]:
+    """Return the parameters that are fitted."""
+    names = FREE[KINDS[actuator.kind].linear]
+    return tuple(name for name in names if name != "f_c" or not actuator.smooth)
 
 
 def find_better(fit: Any) -> dict[str, float]:

@@ -33,6 +33,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.loops.compensation.terms import Compensation, compensate
 from seaopt.control.loops.drift import leave_out_drift
 from seaopt.control.loops.law import Law
+from seaopt.control.loops.loop import Loop
 from seaopt.control.running.outer_run import enclose
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -98,11 +99,21 @@ def _add_turned(plant: Plant, output: str, rate: float) -> Plant:
     return replace(plant, f=f, states={**plant.states, TURNED: plant.outputs[output]})
 
 
+def shows_terms(plant: Plant) -> bool:
+    """Tell whether a plant of `split_states` has outputs of what terms feed back of it."""
+    return not {WEIGHT, AGAINST}.isdisjoint(plant.outputs)
+
+
+def close_whole(controller: Controller, plant: Plant, params: ParameterSet) -> Loop:
+    """Return the loop of a controller around a plant of `split_states`, with what its terms feed back of it."""
+    return close_terms(controller, plant).close(plant, params)
+
+
 def close_terms(controller: Controller, plant: Plant) -> Controller:
     """Return a controller whose law reads what its terms feed back of a plant of `split_states`, and with a weight its
     outer loop; the controller itself where they feed back nothing. Its reference is the force law's.
     """
-    if controller.compensation is None or not {WEIGHT, AGAINST} & plant.outputs.keys():
+    if controller.compensation is None or not shows_terms(plant):
         return controller
     law, signals, force = controller.law, controller.signals, controller.law
     if WEIGHT in plant.outputs:

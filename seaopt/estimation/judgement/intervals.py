@@ -65,7 +65,7 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
     if fit.status != "converged":
         return
     plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
-    smoothing = {name for plant in plants for name in list_smoothing(plant)}
+    smoothing, rough = {name for plant in plants for name in list_smoothing(plant)}, list[str]()
     for name in fit.covariance.names:
         parameter = fit.parameters[name]
         if parameter.known is None or parameter.known <= ROUGH or not parameter.identified or parameter.at_bound:
@@ -75,10 +75,12 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
         defaults = (plant.parameters.get(name) for plant in plants)
         may_be_zero = any(isinstance(default, Parameter) and default.value == 0.0 for default in defaults)
         half = QUANTILE * (parameter.total_std or 0.0)
-        if may_be_zero and half * error.effect[error.names.index(name)] <= UNSEEN:
-            continue
+        if not may_be_zero or half * error.effect[error.names.index(name)] > UNSEEN:
+            rough.append(name)
+    effects = _list_effects(fit) if rough else set[str]()  # makes plants anew
+    for name in rough:
         yield FitFinding(
-            severity="warning" if name in _list_effects(fit) else "error",
+            severity="warning" if name in effects else "error",
             kind="rough",
             where=name,
             text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "

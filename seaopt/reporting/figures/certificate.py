@@ -9,7 +9,7 @@ import numpy as np
 from seaopt.control import Controller
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.loops.port import hold_response, port_of
-from seaopt.control.running.fed_back import close_terms
+from seaopt.control.running.fed_back import close_whole
 from seaopt.errors import ControlError
 from seaopt.plants.friction import take_sliding
 from seaopt.reporting.figures.loop import LOWEST_HZ, Plants, design_of, list_frequencies
@@ -97,7 +97,7 @@ def worst_panel(certificate: Certificate) -> Panel:
             if name in certificate.worst and certificate.worst[name].parameters:
                 cases.append((", worst", (certificate.worst[name][0], certificate.worst[name][1]), "--"))
             for word, (model, values), style in cases:
-                loop = close_terms(controller, model).close(model, values)
+                loop = close_whole(controller, model, values)
                 f = list_frequencies(loop)
                 size = to_decibel(loop.sensitivity(f))
                 axis.plot(f, size, color=colour, linestyle=style, linewidth=1.3, label=f"{name}{word}")

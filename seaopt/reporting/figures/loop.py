@@ -9,7 +9,7 @@ import numpy as np
 
 from seaopt.control import Controller, Loop
 from seaopt.control.loops.loop import STABLE
-from seaopt.control.running.fed_back import close_terms
+from seaopt.control.running.fed_back import close_whole
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -41,7 +41,7 @@ def design_of(controller: Controller) -> tuple[Plant, ParameterSet]:
 def close_loops(controller: Controller, plants: Plants | None = None) -> dict[str, Loop]:
     """Return the loop on each plant; on the design plant where none are given."""
     plants = plants if plants is not None else {"design plant": design_of(controller)}
-    return {name: close_terms(controller, plant).close(plant, values) for name, (plant, values) in plants.items()}
+    return {name: close_whole(controller, plant, values) for name, (plant, values) in plants.items()}
 
 
 def _style_loops(loops: Mapping[str, Loop]) -> Iterator[tuple[Loop, dict[str, Any]]]:

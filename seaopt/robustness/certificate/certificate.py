@@ -183,9 +183,10 @@ class Certificate(Result, Worded):
     def fails_by_weight(self) -> bool:
         """Whether what is compensated of a weight fails, which no tuning mends: its loops are without it."""
         broken = {row.name for row in self.requirements if not row.met}
-        if GRAVITY_COMPENSATION in broken or not broken & {"monte_carlo_failures", "worst_case"}:
-            return GRAVITY_COMPENSATION in broken
-        return WEIGHT in max(self.worst.values(), key=lambda case: case.severity)[0].outputs
+        if GRAVITY_COMPENSATION in broken:
+            return True
+        drawn = broken & {"monte_carlo_failures", "worst_case"}
+        return bool(drawn) and WEIGHT in max(self.worst.values(), key=lambda case: case.severity)[0].outputs
 
     @property
     def values(self) -> tuple[float, ...]:

@@ -203,19 +203,13 @@ def certify(
         _check_responses(plants, measured or {})
     else:
         check_sensors(sensors, law, {"design": law.design[0], **plants})
-    posed = pose(
-        subject if isinstance(subject, ScheduledController) else law,
-        plants,
-        parameters,
-        ranges or {},
-        others or ParameterSet(),
-        bounds,
-    )
+    others, certified = others or ParameterSet(), subject if isinstance(subject, ScheduledController) else law
+    posed = pose(certified, plants, parameters, ranges or {}, others, bounds)
     make = partial(
         Survey,
         subject=subject,
         source=parameters,
-        others=others or ParameterSet(),
+        others=others,
         options=options,
         simulations=simulations and not isinstance(subject, ForceMPC),
         sensors=sensors,

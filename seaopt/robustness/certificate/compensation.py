@@ -30,7 +30,7 @@ from seaopt.control import Controller
 from seaopt.control.compensation.compensate import ENOUGH, find_compensation_margins
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.sampled_plant import find_rest
-from seaopt.control.running.fed_back import AGAINST, WEIGHT
+from seaopt.control.running.fed_back import shows_terms
 from seaopt.control.running.outer_run import close, enclose
 from seaopt.errors import ControlError
 from seaopt.executors import Shared
@@ -69,7 +69,7 @@ def measure_compensation(survey: Survey, _: Progress) -> Evidence:
     """Return whether the loop stays stable with what is compensated, on every plant and over draws."""
     cases, controller = survey.cases, survey.cases.controller
     ripple = None if controller.compensation is None else controller.compensation.ripple
-    closed = {WEIGHT, AGAINST} & {name for plant in cases.plants.values() for name in plant.outputs}
+    closed = any(map(shows_terms, cases.plants.values()))
     opened = ripple is not None and any(ripple.reads in plant.outputs for plant in cases.models.values())
     margins = find_nominal_compensation(controller, cases.models, cases.unknown.nominal)
     shown = {name: partial(_find_margins, each.multiplier) for name, each in margins.items() if each.shown}

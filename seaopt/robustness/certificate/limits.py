@@ -17,7 +17,7 @@ from seaopt.control.laws.verdict import judge
 from seaopt.control.loops.measured.loop import DiscLoop, measure_discs
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY
-from seaopt.control.running.fed_back import close_terms
+from seaopt.control.running.fed_back import close_whole
 from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError
 from seaopt.estimation import Experiment, Fit
@@ -68,9 +68,7 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
         *(nominal[name] for name in nominal if name in {*design.parameters, DRIVE_DELAY})
     )
     varied = [row.name for row in cases.unknown.varied()]
-    figures = {
-        name: close_terms(controller, plant).close(plant, nominal).figures() for name, plant in cases.plants.items()
-    }
+    figures = {name: close_whole(controller, plant, nominal).figures() for name, plant in cases.plants.items()}
     of_model = survey.point and not controller.designs_on_response  # else of the response
     stated = cases.plants if survey.point else {}  # of margins nothing is required, and some take long
     amplitudes = _remark_amplitude(cases, design) if survey.point else ()

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seaopt.control import ScheduledController
-from seaopt.control.running.fed_back import close_terms, split_states
+from seaopt.control.running.fed_back import shows_terms, split_states
 from seaopt.control.scheduling.scheduled_controller import place_variable
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import join_words
@@ -121,7 +121,7 @@ def _bound_plants(
     middle = replace(schedule.controllers[0], law=schedule.table.law(0.5 * (low + high)))
     out: list[StretchBound] = []
     for name, plant in split_states(middle, models, nominal).items():
-        if close_terms(middle, plant) is not middle:
+        if shows_terms(plant):
             out.append(StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=FED_BACK))
             continue
         values = place_variable(plant, nominal, schedule.over, 0.5 * (low + high))

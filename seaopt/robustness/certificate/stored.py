@@ -13,7 +13,7 @@ from seaopt.bench import Sensors
 from seaopt.codec import from_content, join_schemas
 from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
-from seaopt.control.running.fed_back import AGAINST, WEIGHT, close_terms, split_states
+from seaopt.control.running.fed_back import close_whole, shows_terms, split_states
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_schema, check_seal, plain
 from seaopt.parameters import ParameterSet
@@ -219,7 +219,7 @@ def _build_one(
             raise FileError(f'{FILE}: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
     impedance = stored.impedance or StoredImpedance()
     linear = {name: plants[name] for name in stored.plants}
-    if WITH_TERMS not in stored.remarks and any({WEIGHT, AGAINST} & each.outputs.keys() for each in linear.values()):
+    if WITH_TERMS not in stored.remarks and any(map(shows_terms, linear.values())):
         raise FileError(
             f"{FILE}: is of an older seaopt, whose figures leave out what the law's compensation feeds back; "
             f"{CERTIFY_AGAIN}"
@@ -229,10 +229,7 @@ def _build_one(
         certificate = Certificate(
             requirements=read_requirements(content),
             place=place,
-            plants={
-                name: close_terms(controller, plant).close(plant, parameters).figures()
-                for name, plant in linear.items()
-            },
+            plants={name: close_whole(controller, plant, parameters).figures() for name, plant in linear.items()},
             margins={
                 name: plant_margins(controller, plant, parameters)
                 for name, plant in linear.items()

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.loops.sampled_plant import conditions, read_conditions
-from seaopt.control.running.fed_back import close_terms
+from seaopt.control.running.fed_back import close_whole
 from seaopt.formatting import format_figure, html_table
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -132,7 +132,7 @@ class Worst(tuple[Plant, ParameterSet]):
 
     def figures(self, controller: Controller) -> LoopFigures:
         """Return every figure of the loop there, computed again."""
-        return close_terms(controller, self[0]).close(*self).figures()
+        return close_whole(controller, *self).figures()
 
     def verify(self, controller: Controller) -> bool:
         """Return whether the loop, closed again, has the figures that the witness states."""
@@ -207,7 +207,7 @@ def place_values(plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -
 def measure_worst(controller: Controller, plant: Plant, nominal: ParameterSet, at: Mapping[str, float]) -> Worst:
     """Return the worst case at parameters and conditions, its loop closed on its own and not in a batch."""
     values = place_values(plant, nominal, at)
-    figures = close_terms(controller, plant).close(plant, values).figures()
+    figures = close_whole(controller, plant, values).figures()
     single = BatchFigures(
         spectral_radius=np.array([figures.spectral_radius]), ms=np.array([figures.ms]), mt=np.array([figures.mt])
     )
