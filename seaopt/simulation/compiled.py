@@ -6,6 +6,7 @@ A kernel of passes is compiled for each model; what they do to residuals (sums.c
 from __future__ import annotations
 
 import ctypes
+import re
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any
@@ -18,6 +19,7 @@ from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
 from seaopt.signals import VectorM, VectorX
 from seaopt.simulation.discretisation import Clock, transition
+from seaopt.simulation.halves import join_columns, moves_little
 from seaopt.simulation.integrator import output_function, rate_functions, step_function
 from seaopt.simulation.model import Model
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, load_library, row_addresses
@@ -34,7 +36,7 @@ _INFLUENCES = (
 )
 _FIELDS = (  # of seaopt_pass_args behind its channels; pointers are whole numbers
     (np.int64, ("from", "to", "length", "lead", "shared", "drift_terms", "v_columns", "lag_a", "lag_b", "lag_c")),
-    (np.int64, ("settle", "start", "output_rows", "sections", "loss", "warm")),
+    (np.int64, ("settle", "start", "output_rows", "sections", "loss", "warm", "run_up")),
     (np.float64, ("t0", "tau0", "dtau")),
     (np.uint64, ("model", "correction", "x0", "offset", "gain", "drift", "sos", "knee", "gram", "rho", "count")),
     (np.uint64, ("outputs", "columns", "states", "carry")),
@@ -95,7 +97,8 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
         generated += generate_code(rates.rate, rates.output, *([rates.joint] if model.by_events else []))
         generated += _chain_code("rate", rates.rate_pattern, model.nx)
         generated += _chain_code("output", rates.output_pattern, model.ny)
-    headers = map(_text, ("sums.h", "stack.h", "layout.h"))
+    tanh = ("tanh.h",) if re.search(r"\btanh\(", generated) else ()
+    headers = map(_text, ("sums.h", "stack.h", "layout.h", *tanh))
     return "\n".join((define_constants(constants), *headers, generated, _text("pass.c")))
 
 
@@ -270,8 +273,10 @@ class Program:
         for name, array in pointed.items():
             base[name] = self._address(array)
         self.base = base
+        long = segment.n >= PARALLEL and not (layout.corrected or weights.settle or len(weights.sections))
+        self.joins = long and not (model.linear or model.sticks)  # whether two halves may be joined, see `run_halves`
         self.run_up = 0  # samples in which all of a state is forgotten, so that two halves may run at once; 0: serially
-        if model.linear and segment.n >= PARALLEL and not (layout.corrected or weights.settle or len(weights.sections)):
+        if model.linear and long:
             a = data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx]
             self.run_up = _count_memory(a, segment.n // 8)
 
@@ -324,14 +329,54 @@ class Program:
             kept["states"] = np.empty((n, nx))
         arguments = self._place(edges, warm, x0=starts, rho=loss, count=count, **{"gram": gram} if sums else {})
         arguments["output_rows"] = rows
-        if resume is not None:
-            arguments["start"], arguments["carry"] = 0, resume.ctypes.data
+        follow = sums and resume is None and self.joins  # how a state depends on the first
+        carried = self.carry() if follow else resume
+        if carried is not None:
+            arguments["start"], arguments["carry"] = 0, carried.ctypes.data
         for name, array in kept.items():
             if array is not None:
                 arguments[name] = array.ctypes.data
-        buffers = (self.memory, gram, loss, count, kept, starts, resume)
+        buffers = (self.memory, gram, loss, count, kept, starts, carried)
         self.kernel.run(arguments, buffers, parallel=n >= PARALLEL)
-        return Pass(gram=np.sum(gram, axis=0), loss=np.sum(loss, axis=0), count=np.sum(count, axis=0), **kept)
+        by_start = self._read_derivatives(carried)[:, -nx:] if follow and carried is not None else None
+        sums_of = {name: np.sum(each, axis=0) for name, each in (("gram", gram), ("loss", loss), ("count", count))}
+        return Pass(**sums_of, **kept, sensitivity=by_start)
+
+    def run_halves(self, x0: VectorX, run_up: int, *, output_rows: int, columns: bool) -> Pass | None:
+        """Run all samples in two halves at once, the state of the second after a run-up; None where that is not the
+        state in which the first ends. See `seaopt.simulation.halves`.
+        """
+        ny, nc, n = self.model.ny, self.layout.columns, self.segment.n
+        middle = (n + run_up) // 2  # the second half has its run-up besides
+        gram, loss, count = np.zeros((2, ny, nc, nc)), np.zeros((2, ny)), np.zeros((2, ny))
+        outputs, v = np.empty((output_rows, ny)), np.empty((n if columns else 0, ny, nc))
+        starts, end = np.array([x0, x0], dtype=float), self.carry()
+        edges, warm = np.array([0, middle, n]), np.zeros(2, dtype=int)
+        arguments = self._place(edges, warm, x0=starts, rho=loss, count=count, gram=gram)
+        arguments["run_up"], arguments["carry"][0] = (0, run_up), end.ctypes.data
+        arguments["output_rows"] = min(output_rows, middle), max(output_rows - middle, 0)
+        arguments["outputs"] = outputs.ctypes.data + outputs.strides[0] * edges[:2]
+        if columns:
+            arguments["columns"] = v.ctypes.data + v.strides[0] * edges[:2]
+        self.kernel.run(arguments, (self.memory, gram, loss, count, outputs, v, starts, end))
+        z = self._read_derivatives(end)
+        if not moves_little(starts[1] - z[:, 0], gram[1], self.layout):
+            return None
+        join = join_columns(z, self.layout)
+        if columns:
+            v[middle:] = v[middle:] @ join
+        return Pass(
+            gram=gram[0] + join.T @ gram[1] @ join,
+            loss=np.sum(loss, axis=0),
+            count=np.sum(count, axis=0),
+            outputs=outputs if output_rows else None,
+            columns=v if columns else None,
+        )
+
+    def _read_derivatives(self, carried: VectorM) -> Float[np.ndarray, "nx nj"]:
+        """Return the state and its derivatives as a pass leaves them."""
+        width = _pad_to_vectors(self.layout.states)
+        return carried[: self.model.nx * width].reshape(-1, width)[:, : self.layout.states]
 
     def double_sum(self, x0: VectorX, into: Influence, r: Lagged) -> DoubleSum:
         """Return the sum over t, s of a(t)' R(t - s) a(s), and its part t = s; a: influences that count into v."""

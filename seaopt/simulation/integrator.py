@@ -97,6 +97,34 @@ def output_function(model: Model) -> ca.Function:
     return ca.Function("seaopt_output", arguments, [ca.densify(h), *derivatives], {"cse": True})
 
 
+def _take_reciprocals(expression: Any, arguments: list[Any], p: Any) -> tuple[Any, Any, Any]:
+    """Return an expression that multiplies by a symbol where it divided by something of parameters alone, these symbols
+    and what they stand for: a division takes as long as three products, and a step of order four waits for eight.
+    """
+    inputs, outputs, reciprocals = [*arguments, p], [ca.SX(0)] * expression.numel(), dict[str, tuple[Any, Any]]()
+    function, work = ca.Function("expression", inputs, [expression]), dict[int, tuple[Any, bool]]()  # value, varies
+    for k in range(function.n_instructions()):
+        operation, read, (to, *entry) = (
+            function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+        )  # fmt: skip
+        if operation == ca.OP_OUTPUT:
+            outputs[entry[0]] = work[read[0]][0]
+        elif operation == ca.OP_INPUT:
+            work[to] = inputs[read[0]].nz[read[1]], read[0] < len(arguments)
+        elif operation == ca.OP_CONST:
+            work[to] = ca.SX(function.instruction_constant(k)), False
+        else:
+            values, varies = zip(*(work[each] for each in read), strict=True)
+            if operation == ca.OP_DIV and varies == (True, False) and not values[1].is_constant():
+                symbol = ca.SX.sym(f"reciprocal{len(reciprocals)}")
+                value = values[0] * reciprocals.setdefault(str(values[1]), (symbol, 1.0 / values[1]))[0]
+            else:
+                value = (ca.SX.unary if len(values) == 1 else ca.SX.binary)(operation, *values)
+            work[to] = value, any(varies)
+    symbols, meanings = zip(*reciprocals.values(), strict=True) if reciprocals else ((), ())
+    return ca.vertcat(*outputs), ca.vertcat(ca.SX(0, 1), *symbols), ca.vertcat(ca.SX(0, 1), *meanings)
+
+
 @record(eq=False)
 class Rates:
     """Right-hand side and outputs for compiled code, with what depends on parameters alone taken out."""
@@ -124,7 +152,10 @@ def rate_functions(model: Model, *, moving: bool = False) -> Rates:
     dense = [ca.densify(part) if i % 3 == 0 else part for i, part in enumerate(parts)] + joint
     sizes = [part.nnz() for part in dense]
     flat = ca.cse(ca.vertcat(*(entry for part in dense for entry in part.nonzeros())))
-    flat, symbols, values = ca.extract_parametric(flat, model.p, {"extract_trivial": True})
+    reciprocals = meanings = ca.SX(0, 1)
+    if not joint:  # whose events take longer than its rates
+        flat, reciprocals, meanings = _take_reciprocals(flat, [model.t, model.x, model.u, du], model.p)
+    flat, symbols, values = ca.extract_parametric(flat, ca.vertcat(model.p, reciprocals), {"extract_trivial": True})
     c, columns = ca.vertcat(*symbols), []
     for size in sizes:
         columns.append(flat[:size])
@@ -133,7 +164,7 @@ def rate_functions(model: Model, *, moving: bool = False) -> Rates:
     modes = [mode] if joint else []
     rate = ca.Function("seaopt_rate", [*where, du, c, *modes], columns[:3])
     output = ca.Function("seaopt_output", [*where, du, c], columns[3:6])
-    prepare = ca.Function("seaopt_prepare", [model.p], [ca.vertcat(*values)])
+    prepare = ca.Function("seaopt_prepare", [model.p], ca.substitute([ca.vertcat(*values)], [reciprocals], [meanings]))
     pattern = [list(zip(*part.sparsity().get_triplet(), strict=True)) for part in dense]
     return Rates(
         prepare=prepare,

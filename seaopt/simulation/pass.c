@@ -30,11 +30,13 @@ typedef struct {
     long sections;                 /* of sos */
     long loss;                     /* 0 squares, 1 Huber, 2 soft l1 */
     long warm;                     /* rows from `from` that bring the state about, and are in no sum */
+    long run_up;                   /* rows before `from` through which the state goes alone, from x0 */
     double t0;                     /* time of row 0 */
     double tau0, dtau;             /* drift's coordinate, -1 to 1 over the log, at row 0, and its step */
     const double *model;           /* LINEAR: D (NX + NY)(NX + NI)(NJP), A (NX + NY)(NX); else the step's settings, then c */
     const double *correction;      /* CORRECT: NX x NY x NJP, gain and its derivatives */
-    const double *x0;
+    double *x0;                    /* NX: the state at the first row; where the state runs up alone, given at its first row and
+                                      left as it is at `from` */
     const double *offset, *gain;   /* NY */
     const double *drift;           /* NY x drift_terms */
     const double *sos;             /* sections x 5: b0 b1 b2 a1 a2 */
@@ -635,6 +637,19 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
     deliver(q, a);
 }
 
+/* What goes on in a state that is let go `run_up` rows before a pass begins. */
+ONCE void run_up(const seaopt_pass_args *a) {
+    state reached;
+    seaopt_pass_args alone = *a;
+    alone.from = alone.start = a->from - a->run_up;
+    alone.to = a->from;
+    alone.gram = alone.outputs = alone.columns = alone.states = 0;
+    alone.into.into = 0;
+    alone.carry = (double *)&reached;
+    one_pass(&alone, 1);
+    for (int i = 0; i < NX; i++) a->x0[i] = reached.z[i][0];
+}
+
 typedef struct { const seaopt_pass_args *list; long count; } jobs;
 
 static void *run_jobs(void *given) {
@@ -642,6 +657,7 @@ static void *run_jobs(void *given) {
     const unsigned long mode = flush_denormals();
     for (long i = 0; i < all->count; i++) {
         const seaopt_pass_args *one = all->list + i;
+        if (one->run_up) run_up(one);
         if (MEASURED && (ALL == 1 || one->gram || one->columns || one->into.into)) one_pass(one, ALL);
         else one_pass(one, 1);
     }
@@ -650,7 +666,7 @@ static void *run_jobs(void *given) {
 }
 
 /* Both ways of a pass have their arrays in one frame; then come those of a step, of CasADi's functions, and of influences. */
-#define STACK (3 * sizeof(hot) + sizeof(double) * (24 * (NX + NY) * (NJP + 2 * NU + 2) + 4 * NY * NY))
+#define STACK (3 * sizeof(hot) + sizeof(state) + sizeof(double) * (24 * (NX + NY) * (NJP + 2 * NU + 2) + 4 * NY * NY))
 
 EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
     jobs all = {list, count};

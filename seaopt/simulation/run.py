@@ -12,6 +12,7 @@ from typing import Any
 from seaopt.signals import VectorX
 from seaopt.simulation.compiled import Program, double_sum_of_columns
 from seaopt.simulation.discretisation import check_period
+from seaopt.simulation.halves import find_run_up
 from seaopt.simulation.interpreted import interpret_pass, read_measured
 from seaopt.simulation.model import Model
 from seaopt.simulation.passes import DoubleSum, Influence, Lagged, Pass, Point, Segment, Weights
@@ -28,6 +29,7 @@ class _Kept:
 
     def __init__(self) -> None:
         self._passes: dict[Any, tuple[Pass, Model, Segment]] = {}
+        self._run_ups: dict[int, tuple[int, Segment]] = {}
         self._bytes = 0
         self._lock = Lock()
 
@@ -49,6 +51,14 @@ class _Kept:
             self._bytes += _measure_bytes(result)
             while self._bytes > KEPT_BYTES:
                 self._drop(next(iter(self._passes)))
+
+    def find_run_up(self, segment: Segment) -> int | None:
+        """Return in how many samples of a segment a state is forgotten, 0 where they are too many; None: not known."""
+        return self._run_ups.get(id(segment), (None, segment))[0]
+
+    def keep_run_up(self, segment: Segment, samples: int) -> None:
+        """Keep in how many samples of a segment a state is forgotten."""
+        self._run_ups[id(segment)] = samples, segment
 
     def _drop(self, key: Any) -> None:
         if key in self._passes:
@@ -137,9 +147,11 @@ def run_passes(
         program = Program.make(model, segment, point, chosen)
         if program is None:
             result = interpret_pass(model, segment, point, chosen, last, x0)
+        elif kept is not None:
+            result = _run_kept(kept, program, x0, output_rows=made, columns=columns or whole)
         else:
             result = program.run(
-                0, last, x0, sums=sums, outputs=made > 0, output_rows=made, columns=columns or whole, states=states
+                0, last, x0, sums=sums, outputs=made > 0, output_rows=made, columns=columns, states=states
             )
         if kept is not None:
             kept.add(key, result, model, segment)
@@ -149,6 +161,21 @@ def run_passes(
         columns=result.columns if columns else None,
         states=result.states if states else None,
     )
+
+
+def _run_kept(kept: _Kept, program: Program, x0: VectorX, *, output_rows: int, columns: bool) -> Pass:
+    """Run a whole segment with its sums: as two halves at once where an earlier pass shows that it forgets a state."""
+    segment = program.segment
+    run_up = kept.find_run_up(segment) if program.joins else 0
+    if run_up:
+        result = program.run_halves(x0, run_up, output_rows=output_rows, columns=columns)
+        if result is not None:
+            return result
+        kept.keep_run_up(segment, 0)
+    result = program.run(0, segment.n, x0, outputs=output_rows > 0, output_rows=output_rows, columns=columns)
+    if run_up is None and result.sensitivity is not None:
+        kept.keep_run_up(segment, find_run_up(result.sensitivity, segment.n))
+    return result
 
 
 def stream(
