@@ -5,7 +5,9 @@ fitted and over those that are held out: what follows the one part alone explain
 step predicts: a spring that hardens ranked sixth by its step, and was the cause. So each hypothesis takes several,
 from the fit's values; one that does not help is left soon. None is taken that leaves the excess high, unless it takes
 98 % of its power: friction that grows with the load takes a part of nearly everything. Where one does not suffice the
-best three are joined with each other, and then with every other one, two in all.
+best three are joined with each other, and then with every other one, two in all. A second effect has to earn its place:
+a pair often gets on where its parts got stuck, so that either is then tried alone from there; and beside one that would
+be taken alone it has to remove all of the excess that is left.
 
 What this may cost is counted in evaluations of the problem, so that the same log has the same answer on any machine.
 """
@@ -166,7 +168,8 @@ class _Search:
         if self.first > REMOVED:
             problem, fitted = coarsen(problem, self.minimum.z)
         single = list(self.try_each(problem, fitted, self.fit.experiments, self.fit.parameters))
-        refits = sorted(single, key=lambda refit: refit.excess)
+        single.sort(key=lambda refit: refit.excess)
+        refits = sorted([*map(self.go_on, single[:BASES]), *single[BASES:]], key=lambda refit: refit.excess)
         bases = refits[:BASES]
         partners = [refit.change.hypotheses[-1] for refit in bases]
         # The best with each other first: of two effects either alone may take little.
@@ -183,7 +186,28 @@ class _Search:
             return refits
         # Near noise likelihoods tell apart what hardly differs in excess.
         best = min(refits, key=lambda refit: refit.excess if self.first > ASKS else -refit.gain)
-        return [*(refit for refit in refits if refit is not best), _settle(best, best.evaluation)]
+        settled = _settle(best, best.evaluation)
+        return _keep_best([*(refit for refit in refits if refit is not best), settled, *self.try_alone(settled)])
+
+    def go_on(self, refit: Refit) -> Refit:
+        """Return a refit that has helped and was left before its minimum after as many rounds again."""
+        if refit.at_minimum or refit.excess > (1.0 - self.helps) * self.first:
+            return refit
+        start = refit.evaluation
+        further = _descend(refit.change, refit.problem, start, self.base, self.base, self.helps, self.end)
+        return replace(further, evaluations=refit.evaluations + further.evaluations) if further else refit
+
+    def try_alone(self, pair: Refit) -> Iterator[Refit]:
+        """Yield each part of a pair alone, from the pair's values: one of them may explain as much."""
+        for hypothesis in pair.change.hypotheses if len(pair.change.hypotheses) > 1 else ():
+            change = change_plants(hypothesis, self.fit.experiments, self.fit.parameters, self.sizes)
+            assert change is not None  # it is in a pair
+            problem = _pose(change, pair.problem)
+            start = problem.evaluate(problem.unknowns.start_from(pair.values))
+            end = count_evaluations() + ROUNDS * ROUND  # whatever is left of the budget: a pair is not believed without
+            refit = _descend(change, problem, start, self.base, self.base, self.helps, end)
+            if refit is not None:
+                yield refit
 
     def try_each(
         self,
@@ -214,6 +238,14 @@ class _Search:
                 yield refit
 
 
+def _keep_best(refits: Sequence[Refit]) -> list[Refit]:
+    """Return the refits, of several with the same hypotheses the one that leaves the least."""
+    best = dict[frozenset[Hypothesis], Refit]()
+    for refit in sorted(refits, key=lambda refit: refit.excess):
+        best.setdefault(frozenset(refit.change.hypotheses), refit)
+    return list(best.values())
+
+
 def _take_values(refit: Refit) -> ParameterSet:
     """Return a refit's parameters at its minimum."""
     return refit.problem.params.update(**{name: refit.values[name] for name in refit.problem.shared_names})
@@ -228,13 +260,33 @@ def _refit(
     that has come to `end`, a count of evaluations.
     """
     before = count_evaluations()
-    problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
-    for name in ("sigma", "substeps"):
-        problem = problem.with_values(name, {e.name: getattr(e, name) for e in old.experiments})
+    problem = _pose(change, old)
     problem, start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
     if not np.isfinite(start.cost):
         return None
-    problem = _rest(problem, start, old)
+    refit = _descend(change, _rest(problem, start, old), start, fitted, base, helps, end)
+    return refit and replace(refit, evaluations=count_evaluations() - before)
+
+
+def _pose(change: Change, old: FitProblem) -> FitProblem:
+    """Return a change's problem, with the noise and the steps of another one of the same logs."""
+    problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
+    for name in ("sigma", "substeps"):
+        problem = problem.with_values(name, {e.name: getattr(e, name) for e in old.experiments})
+    return problem
+
+
+def _descend(
+    change: Change,
+    problem: FitProblem,
+    start: Evaluation,
+    fitted: Evaluation,
+    base: Evaluation,
+    helps: float,
+    end: int,
+) -> Refit | None:
+    """Return the minimum that rounds of iterations come to from a start, as `_refit` does."""
+    before = count_evaluations()
     evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
     at_fit = least = checked = _measure_powers(fitted)
     radius = FIRST_RADIUS
@@ -381,13 +433,15 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
     """
     single = [refit for refit in refits if len(refit.change.hypotheses) == 1]
     best_single = min((refit.excess for refit in single), default=np.inf)
-    # Two effects are taken where one leaves an excess, and the other takes half of that.
+    # Two effects are taken where one leaves an excess, and the other takes half of that; where one would do, all of it.
+    most = max(REMOVED, NEARLY * first)
+    most_of_pair = most if best_single > most else ASKS
     able = [
         refit
         for refit in refits
-        if refit.excess <= max(REMOVED, NEARLY * first)
+        if refit.excess <= most
         and (_takes_half(first, refit.excess) if first > ASKS else refit.gain > CHANCE * colour)
-        and (refit in single or (best_single > ASKS and _takes_half(best_single, refit.excess)))
+        and (refit in single or (refit.excess <= most_of_pair < best_single and _takes_half(best_single, refit.excess)))
     ]
     least = min((refit.excess for refit in able), default=np.inf)
     tied = [refit for refit in able if refit.excess <= TIED * least]
