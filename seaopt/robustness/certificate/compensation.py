@@ -30,7 +30,6 @@ from seaopt.control import Controller
 from seaopt.control.compensation.compensate import ENOUGH, find_compensation_margins
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.sampled_plant import find_rest
-from seaopt.control.running.fed_back import shows_terms
 from seaopt.control.running.outer_run import close, enclose
 from seaopt.errors import ControlError
 from seaopt.executors import Shared
@@ -53,11 +52,6 @@ EIGENVALUE_DRAWS = 20  # at most so many are looked at, of gravity and of ripple
 SLOPES = 9  # from the steepest negative to the steepest positive
 PLACES, INSIDE = 9, 0.95  # over so much of the range
 NEUTRAL = 1e-6  # beyond 1, of an eigenvalue that neither grows nor decays, by rounding and the series' last digits
-WITH_TERMS = (
-    "margins, worst cases and draws of every plant are of the loop with what is compensated of its weight and, around "
-    "that, the outer loop, and where it sticks with friction's compensation from the speed; what is asked of the "
-    "design plant alone is of the law as tuned"
-)
 WITHOUT_RIPPLE = (
     "margins, worst cases and draws are of the law without its compensation of ripple, with which stability alone is "
     "shown"
@@ -69,7 +63,6 @@ def measure_compensation(survey: Survey, _: Progress) -> Evidence:
     """Return whether the loop stays stable with what is compensated, on every plant and over draws."""
     cases, controller = survey.cases, survey.cases.controller
     ripple = None if controller.compensation is None else controller.compensation.ripple
-    closed = any(map(shows_terms, cases.plants.values()))
     opened = ripple is not None and any(ripple.reads in plant.outputs for plant in cases.models.values())
     margins = find_nominal_compensation(controller, cases.models, cases.unknown.nominal)
     shown = {name: partial(_find_margins, each.multiplier) for name, each in margins.items() if each.shown}
@@ -81,7 +74,7 @@ def measure_compensation(survey: Survey, _: Progress) -> Evidence:
             *eigenvalue_requirements(controller, cases.models, gravity, ripple),
         ),
         fields={"compensation": margins, "compensation_draws": draws},
-        remarks=(*((WITH_TERMS,) if closed else ()), *((WITHOUT_RIPPLE,) if opened else ())),
+        remarks=(WITHOUT_RIPPLE,) if opened else (),
     )
 
 

@@ -17,7 +17,7 @@ from seaopt.control.laws.verdict import judge
 from seaopt.control.loops.measured.loop import DiscLoop, measure_discs
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY
-from seaopt.control.running.fed_back import close_whole
+from seaopt.control.running.fed_back import close_whole, feeds_back
 from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError
 from seaopt.estimation import Experiment, Fit
@@ -45,6 +45,11 @@ from seaopt.robustness.verification.scenarios import STEP_SHARES
 
 PASSIVE = "passive_band_hz"
 LOG_SENSITIVITY = "log_sensitivity"
+WITH_TERMS = (
+    "margins, worst cases and draws of every plant are of the loop with the outer loop around it, with what is "
+    "compensated of its weight and, where it sticks, with friction's compensation from the speed; what is asked of the "
+    "design plant alone is of the law as tuned"
+)
 NO_LOG = "no log of the fit is of a plant that is certified, so that none judges the law"
 SILENT = {
     "lacks a signal": "log {0.experiment} does not judge the law: it has no {0.detail}",
@@ -72,6 +77,7 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
     of_model = survey.point and not controller.designs_on_response  # else of the response
     stated = cases.plants if survey.point else {}  # of margins nothing is required, and some take long
     amplitudes = _remark_amplitude(cases, design) if survey.point else ()
+    closed = any(feeds_back(controller, plant) for plant in cases.plants.values())
     return Evidence(
         requirements=(
             *(design_requirements(controller, design, of_design, varied) if of_model else ()),
@@ -81,7 +87,7 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
             "plants": figures,
             "margins": {name: plant_margins(controller, plant, nominal) for name, plant in stated.items()},
         },
-        remarks=(*warn_delays(controller.spec, design, survey.source), *amplitudes),
+        remarks=(*warn_delays(controller.spec, design, survey.source), *amplitudes, *((WITH_TERMS,) if closed else ())),
     )
 
 

@@ -13,7 +13,7 @@ from seaopt.bench import Sensors
 from seaopt.codec import from_content, join_schemas
 from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
-from seaopt.control.running.fed_back import close_whole, shows_terms, split_states
+from seaopt.control.running.fed_back import close_whole, feeds_back, split_states
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_schema, check_seal, plain
 from seaopt.parameters import ParameterSet
@@ -25,12 +25,12 @@ from seaopt.robustness.certificate.cases import Cases
 from seaopt.robustness.certificate.certificate import NO_MODEL, ROBUSTNESS_SCHEMA, Certificate
 from seaopt.robustness.certificate.compensation import (
     FRICTION_COMPENSATION,
-    WITH_TERMS,
     find_nominal_compensation,
 )
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import MarginDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
+from seaopt.robustness.certificate.limits import WITH_TERMS
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
 from seaopt.robustness.certificate.scheduled import take_worst
 from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
@@ -219,10 +219,10 @@ def _build_one(
             raise FileError(f'{FILE}: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
     impedance = stored.impedance or StoredImpedance()
     linear = {name: plants[name] for name in stored.plants}
-    if WITH_TERMS not in stored.remarks and any(map(shows_terms, linear.values())):
+    if WITH_TERMS not in stored.remarks and any(feeds_back(controller, plant) for plant in linear.values()):
         raise FileError(
-            f"{FILE}: is of an older seaopt, whose figures leave out what the law's compensation feeds back; "
-            f"{CERTIFY_AGAIN}"
+            f"{FILE}: is of an older seaopt, whose figures leave out what the law's compensation or outer loop feeds "
+            f"back; {CERTIFY_AGAIN}"
         )
     try:
         worst = {name: content["plants"][name]["worst"] for name in linear}
