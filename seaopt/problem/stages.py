@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -17,6 +17,7 @@ from seaopt.control import (
     CompensateGravity,
     CompensateRipple,
     Controller,
+    ControllerSpec,
     ForceMPC,
     GivenLaw,
     Impedance,
@@ -56,7 +57,7 @@ from seaopt.robustness import (
     linear_controller,
     tune_certified,
 )
-from seaopt.robustness.certificate.joint import breaks_at_draws
+from seaopt.robustness.certificate.reserve import Look, keep_reserve, look_at_draws
 from seaopt.robustness.verification.verification import list_readings
 from seaopt.signals import Signal
 from seaopt.simulation import simulate
@@ -194,10 +195,17 @@ def tune_problem(
     if schedule is not None:
         scheduled = {"over": schedule.over, "points": schedule.points, "bandwidths_hz": schedule.bandwidth_hz}
     if schedule is not None and not rounds:
-        tuned = tune_schedule(
-            problem.design_plant, values, spec, robust_to=robust_to, **scheduled, draws=draws, progress=progress
-        )
-        return complete_schedule(problem, tuned, source)
+
+        def make(
+            asked: ControllerSpec, witnesses: Mapping[str, Any], near: ScheduledController | None, part: Progress
+        ) -> ScheduledController:
+            options: dict[str, Any] = {**scheduled, "draws": draws, "near": near, "progress": part}
+            tuned = tune_schedule(problem.design_plant, values, asked, robust_to={**robust_to, **witnesses}, **options)
+            return complete_schedule(problem, tuned, source)
+
+        if rounds == 0:
+            return make(spec, {}, None, progress)
+        return keep_reserve(make, partial(_look, problem, source=source), spec, progress)
     if not rounds:
         tuned = tune(design, values, spec, robust_to, draws=draws, progress=progress)
         tuned = complete_controller(problem, tuned, source)
@@ -234,10 +242,15 @@ def _needs_reserve(problem: Problem, controller: Controller, source: Fit | Param
     """Tell whether a controller that keeps its limits breaks one at the draws of its certificate."""
     if not controller.met or problem.response_names:
         return False
+    return any(each.is_over for each in _look(problem, controller, source).values())
+
+
+def _look(problem: Problem, law: Controller | ScheduledController, source: Fit | ParameterSet) -> dict[str, Look]:
+    """Return the worst case of every plant of the certificate, at a look."""
     try:
-        return breaks_at_draws(controller, problem.certified_plants(), source, problem.ranges, problem.parameters)
+        return look_at_draws(law, problem.certified_plants(), source, problem.ranges, problem.parameters)
     except ControlError:  # of what nothing can be drawn: the certificate says so, and needs it
-        return False
+        return {}
 
 
 def complete_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:

@@ -36,7 +36,7 @@ from seaopt.control.scheduling.scheduled_controller import (
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.law_numbers import LawNumbers
+from seaopt.control.tuning.law_numbers import LawNumbers, read_numbers
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import Solution, recheck, solve
 from seaopt.control.tuning.tuner import Draws, RobustTo, make_controller, make_task, tune
@@ -61,6 +61,7 @@ def tune_schedule(
     *,
     bandwidths_hz: Sequence[float] | None = None,
     draws: Draws = (),
+    near: ScheduledController | None = None,
     progress: Progress = ignore,
 ) -> ScheduledController:
     """Tune a controller per point of a scheduling variable, with gains that are interpolated between the points.
@@ -86,6 +87,9 @@ def tune_schedule(
         One per point, in place of the specification's.
     draws : sequence of mappings, optional
         As in `seaopt.tune`.
+    near : ScheduledController, optional
+        The schedule of these points under other limits, or on other plants: each point is started from its gains there,
+        and not from a scan at an end.
     progress : callable, optional
         Called with what is done and the share of it that is done.
 
@@ -134,7 +138,9 @@ def tune_schedule(
     ]
     tasks = [_share_nominal(task, tasks[len(tasks) // 2]) for task in tasks]
     controllers: list[Controller] = []
-    for (at_point, at_points), task, (x, loops) in zip(placed, tasks, _choose_chain(tasks, progress), strict=True):
+    for (at_point, at_points), task, (x, loops) in zip(
+        placed, tasks, _choose_chain(tasks, near, progress), strict=True
+    ):
         # What blocks, and what is possible instead, is for the tuner to say; its observer would have another plant.
         if task.nominal is None and _breaks_limits(task, loops):
             controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws))
@@ -209,8 +215,13 @@ def _share_nominal(task: Task, other: Task) -> Task:
     return replace(task, nominal=other.nominal.scaled(gain))
 
 
-def _choose_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
-    """Return the numbers of every point with their loops, of the better of the chains from either end."""
+def _choose_chain(tasks: Sequence[Task], near: ScheduledController | None, progress: Progress) -> Chain:
+    """Return the numbers of every point with their loops: those reached from a schedule that is near, or where these
+    break limits those of the better of the chains from either end.
+    """
+    chain = None if near is None else _follow_schedule(tasks, near)
+    if chain is not None:
+        return chain
     forward, backward = divide(progress, 1.0, 1.0)
     chains = [_tune_chain(tasks, forward), _tune_chain(tasks[::-1], backward)[::-1]]
     values, broken = np.zeros((2, len(tasks))), [0, 0]
@@ -233,6 +244,19 @@ def _tune_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
         x = _follow(task, before)
         loops = task.measure(x)
         chain.append(solve(task, [before]) if _breaks_limits(task, loops) else (x, loops))
+    return chain
+
+
+def _follow_schedule(tasks: Sequence[Task], near: ScheduledController) -> Chain | None:
+    """Return the numbers reached at every point from those of a schedule; None where these break a limit. What a scan
+    has at one point alone may be of another valley than its neighbours.
+    """
+    chain: Chain = []
+    for task, law in zip(tasks, near.controllers, strict=True):
+        x = _follow(task, read_numbers(law.gains, task.k_ff, task.spec.sample_time_s))
+        chain.append((x, task.measure(x)))
+        if _breaks_limits(task, chain[-1][1]):
+            return None
     return chain
 
 

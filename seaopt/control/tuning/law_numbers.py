@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
@@ -20,6 +22,23 @@ def least_integral_rate(x: LawNumbers) -> float:
     rate :math:`(T_v + k_p/k_i)^{-1}`; with this k_i it is at least the least rate of one for every T_v allowed.
     """
     return INTEGRAL_RAD_S / (1.0 - INTEGRAL_RAD_S / SLOWEST_SPEED_RATE) if x[SPEED_RATE] > 0.0 else INTEGRAL_RAD_S
+
+
+def read_numbers(gains: Mapping[str, float], k_ff: float, ts: float) -> LawNumbers:
+    """Return the numbers of gains by name, the inverse of `Task.gains`; those that a law does not have are ones. `k_ff`
+    is 1/P(0).
+    """
+    x = np.ones(14)
+    x[[K_P, K_I, K_D, T_F]] = [gains[name] for name in ("k_p", "k_i", "k_d", "T_f")]
+    x[W_R] = gains["k_p"] - gains["k_r"] + (0.0 if "k_v" in gains else k_ff)
+    x[W_C] = (1.0 - gains["c"]) * gains["k_d"]
+    x[SPEED_RATE] = 1.0 / gains["T_v"] if "T_v" in gains else 0.0
+    for name, place in (("k_v", K_V), ("T_q", T_Q), ("notch_width", NOTCH_WIDTH), ("notch_depth", NOTCH_DEPTH)):
+        x[place] = gains.get(name, 1.0)
+    for name, place in (("notch_frequency_hz", NOTCH_W), ("prefilter_corner_hz", PREFILTER_W)):
+        x[place] = warp_frequency(gains[name], ts) if name in gains else 1.0
+    x[DAMPING] = gains.get("prefilter_damping", 1.0)
+    return x
 
 
 def warp_frequency(f: float, ts: float) -> float:

@@ -21,20 +21,17 @@ import numpy as np
 
 from seaopt.control import Controller, ControllerSpec, ScheduledController, tune, tune_schedule
 from seaopt.control.laws.delay import settle_delays
-from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
-from seaopt.executors import Shared
 from seaopt.formatting import format_count, format_table, format_values, html_text
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import Result, record
-from seaopt.robustness.certificate.cases import CONFIDENCE, check_numbers, pose_cases
+from seaopt.robustness.certificate.cases import CONFIDENCE, check_numbers
 from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
-from seaopt.robustness.certificate.measured_draws import measure_draws, search_worst
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
@@ -42,7 +39,6 @@ from seaopt.robustness.uncertainty.worst import place_values
 
 MOST_ROUNDS = 6
 TUNING, CERTIFYING = 1.0, 2.0  # of the time of a round
-LOOKED_AT, LOOK_STREAM = 64, 0x100C  # draws of a first look, and their seed, which no certificate has
 SAME_WITNESS = 1e-6  # witnesses that differ by less than this share in every parameter are one
 Witnesses = Mapping[str, tuple[Plant, ParameterSet] | MeasuredResponse]
 
@@ -256,19 +252,6 @@ def tune_certified(
         progress(f"{status} after {format_count(number, 'round')}", 1.0)
         return JointTuning(status=status, rounds=tuple(finished), robust_to=witnesses, **made)
     raise AssertionError("the last round has a status")
-
-
-def breaks_at_draws(
-    controller: Controller, plants: Plants, parameters: Source, ranges: Ranges, others: ParameterSet
-) -> bool:
-    """Tell whether a law breaks Ms, Mt or stability at a few of `certify`'s draws, or in a search from them."""
-    cases = Shared(pose_cases(controller, plants, parameters, ranges, others))
-    if not cases.value.unknown.size:
-        return False
-    _, drawn, _ = measure_draws(cases, LOOKED_AT, np.random.default_rng(LOOK_STREAM), None, ignore)
-    worst, _ = search_worst(cases, drawn, None, ignore)
-    least = {True: 1.0 + LIMIT_ROUNDING, False: UNSTABLE}
-    return any(case.severity > least[case.limited] for case in worst.values())
 
 
 def _list_new_witnesses(

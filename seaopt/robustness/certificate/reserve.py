@@ -1,0 +1,150 @@
+"""The reserve that a certificate's draws need: a look at some draws of a law, and a schedule tuned again for them.
+
+The tuner puts a law on its limits at the nominal parameters, and draws break them by a little. So a tuned law is looked
+at where a certificate will: a few draws on every plant, of a schedule at its points and between them, and a search from
+those of the value that is worst. What one value's search finds is tried at all others, as it is bad there as a rule,
+and another is searched only where that leaves something worse.
+
+What is over a limit is given to the tuner as one more plant. It knows the law alone, at the points: with what terms
+feed back, or between the points, more of a limit may be used, by a factor that hardly changes as the law does. That
+factor is taken off all limits, as a reserve. Draws and searches are never those of a certificate, which says with draws
+of its own what the law is worth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.control import Controller, ControllerSpec, ScheduledController
+from seaopt.control.laws.limits import LIMIT_ROUNDING
+from seaopt.formatting import format_values
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.progress import Progress, divide, prefix
+from seaopt.records import record
+from seaopt.robustness.certificate.cases import Cases, pose
+from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.robustness.uncertainty.draws import Column, Plants, Points, Ranges, Source
+from seaopt.robustness.uncertainty.severity import UNSTABLE, severities
+from seaopt.robustness.uncertainty.worst import Worst, find_worst
+
+LOOKED_AT, LOOK_STREAM = 64, 0x100C  # draws of a look, and their seed, which no certificate has
+SEARCHES = 4  # of each plant, at values of a schedule
+ROUNDS = 3  # of looking and tuning again
+ROOM = 1e-3  # more than what was found asks, as the next law is another
+MOST_RESERVE = 0.15  # more of it is none: points are missing, or a term asks too much
+NEAR = 0.98  # of the limits: what uses less is no witness
+BETWEEN = 0.03  # of a schedule that breaks a limit between its points at the nominal parameters already
+Witnesses = Mapping[str, tuple[Plant, ParameterSet]]
+Make = Callable[[ControllerSpec, Witnesses, ScheduledController | None, Progress], ScheduledController]
+
+
+@record(eq=False)
+class Look:
+    """The worst case of a plant, and how much of the limits the law alone uses there, at its points if scheduled."""
+
+    worst: Worst
+    alone: float
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it breaks Ms, Mt or, where neither is asked, stability."""
+        return self.worst.severity > (1.0 + LIMIT_ROUNDING if self.worst.limited else UNSTABLE)
+
+    @property
+    def needed(self) -> float:
+        """The reserve with which the law alone leaves room for what uses more; none where that makes it unstable."""
+        return 0.0 if self.worst.severity >= UNSTABLE else 1.0 - self.alone / self.worst.severity + ROOM
+
+
+def look_at_draws(
+    law: Controller | ScheduledController, plants: Plants, parameters: Source, ranges: Ranges, others: ParameterSet
+) -> dict[str, Look]:
+    """Return of each plant the worst case that a few of `certify`'s draws and searches from them find, at the value of
+    a schedule where it is worst; none where nothing is uncertain.
+    """
+    posed = pose(law, plants, parameters, ranges, others)
+    first, *_ = cases = list(posed.values())
+    if not first.unknown.size:
+        return {}
+    points = first.unknown.draw(LOOKED_AT, np.random.default_rng(LOOK_STREAM))
+    tuned_at = law.points if isinstance(law, ScheduledController) else (None,)
+    tuned = [each for value, each in posed.items() if value in tuned_at]
+    return {name: _look_at_plant(cases, tuned, name, points) for name in first.plants}
+
+
+def _look_at_plant(posed: Sequence[Cases], tuned: Sequence[Cases], name: str, points: Points) -> Look:
+    """Return the worst case of a plant at all values, those at which the law was `tuned` among them."""
+    most = np.array([np.max(_rank(cases, name, cases.unknown.values(points))) for cases in posed])
+    found: dict[int, Worst] = {}
+    while len(found) < SEARCHES and (at := int(np.argmax(most))) not in found:
+        cases = posed[at]
+        found[at] = find_worst(cases.controller, cases.plants[name], cases.unknown, points)
+        most = np.maximum(most, [_rank_one(each, name, found[at]) for each in posed])
+        most[at] = found[at].severity
+    worst = max(found.values(), key=lambda case: case.severity)
+    alone = (replace(each, controller=replace(each.controller, compensation=None, outer=None)) for each in tuned)
+    return Look(worst=worst, alone=max(_rank_one(each, name, worst) for each in alone))
+
+
+def _rank(cases: Cases, name: str, values: Mapping[str, Column]) -> Column:
+    figures = batch_figures(cases.controller, cases.plants[name], cases.unknown.nominal, values)
+    return severities(cases.controller, figures)
+
+
+def _rank_one(cases: Cases, name: str, worst: Worst) -> float:
+    return float(_rank(cases, name, {key: np.array([value]) for key, value in worst.parameters.items()})[0])
+
+
+def keep_reserve(
+    make: Make, look: Callable[[ScheduledController], Mapping[str, Look]], spec: ControllerSpec, progress: Progress
+) -> ScheduledController:
+    """Return a schedule that keeps its limits at the draws that are looked at, too, tuned again until it does. Where
+    none does, it is the one that misses least, or one that misses limits at its points, which says what can be had.
+    `make` tunes with a specification, with further plants on which its limits are kept, near a schedule; `look` returns
+    the worst case of each plant.
+    """
+    witnesses: dict[str, tuple[Plant, ParameterSet]] = {}
+    first, *again = divide(progress, *(1.0 for _ in range(1 + ROUNDS)))
+    kept = schedule = make(spec, witnesses, None, first)
+    least = math.inf
+    for number, part in enumerate((*again, None), start=1):
+        if not all(each.met for each in schedule.controllers):
+            return schedule
+        looks, broken = look(schedule), any(place.broken for place in schedule.between)
+        over = [each for each in looks.values() if each.is_over]
+        missed = max((each.worst.severity for each in over), default=0.0) + UNSTABLE * broken
+        if missed >= least:
+            break
+        kept, least, needed = schedule, missed, find_reserve(spec, over, BETWEEN if broken else 0.0)
+        if not missed or needed > MOST_RESERVE or part is None:
+            break
+        spec = replace(spec, reserve=needed)
+        for name, each in looks.items():
+            witnesses |= list_witnesses(name, number, each.worst)
+        schedule = make(spec, witnesses, schedule, prefix(part, f"with worst cases, round {number}"))
+    progress("worst cases looked at", 1.0)
+    return kept
+
+
+def find_reserve(spec: ControllerSpec, over: Iterable[Look], least: float = 0.0) -> float:
+    """Return the reserve of a specification, or more where what is over a limit needs more than the law alone."""
+    return max(spec.reserve, least, *(each.needed for each in over))
+
+
+def list_witnesses(name: str, number: int, worst: Worst) -> Witnesses:
+    """Return where a plant has its largest Ms and its largest Mt, by name, but for those far from the limits: what
+    mends one of them brings the other up to its limit.
+    """
+    near = (each for each in (worst.witness, *worst.largest) if each.severity > NEAR)
+    return {
+        f"{name}, round {number}: {format_values(each.parameters, missing='nominal')}": (
+            worst[0],
+            worst[1].update(**each.parameters),
+        )
+        for each in near
+    }
