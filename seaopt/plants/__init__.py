@@ -8,14 +8,14 @@ from seaopt.plants.motor.thermal import MotorRating, rate_motor, winding
 from seaopt.plants.parts import PARTS, add_part, wrapped
 from seaopt.plants.plant import CompletedParameters, Plant, jacobians, state_space
 from seaopt.plants.published import thor
-from seaopt.plants.roles import Actuation, Friction, Mode, Port, Sensing, SeriesSpring, Winding
+from seaopt.plants.roles import Actuation, Friction, Mode, Port, Reading, Sensing, SeriesSpring, Winding
 from seaopt.plants.rotary import rotary
 from seaopt.plants.sensors.difference import Difference
 from seaopt.plants.two_link import high_impedance, moving_output, two_link
 
 __all__ = [
     "KINDS", "PARTS", "Actuation", "CompletedParameters", "Difference", "Friction", "Mode", "Modes",
-    "MotorRating", "Plant", "Port", "Resonance", "Sensing", "SeriesSpring", "Winding", "add_part", "export_fmu",
-    "high_impedance", "jacobians", "known_parameters", "let_stick", "modes", "moving_output", "plant_of_kind",
-    "rate_motor", "rotary", "state_space", "thor", "to_control", "two_link", "winding", "wrapped",
+    "MotorRating", "Plant", "Port", "Reading", "Resonance", "Sensing", "SeriesSpring", "Winding", "add_part",
+    "export_fmu", "high_impedance", "jacobians", "known_parameters", "let_stick", "modes", "moving_output",
+    "plant_of_kind", "rate_motor", "rotary", "state_space", "thor", "to_control", "two_link", "winding", "wrapped",
 ]  # fmt: skip

@@ -38,6 +38,7 @@ from seaopt.plants.roles import (
     Friction,
     Mode,
     Port,
+    Reading,
     Recipe,
     Sampling,
     Sensing,
@@ -90,6 +91,9 @@ class Plant:
         States that hold what was sampled; f is zero for them.
     clock : str, optional
         The optional input that is the time since a log's beginning, s: counted where the log has no such channel.
+    followed : mapping of name to Reading, optional
+        States that f and h take by another name, ``u.NAME``, among the inputs: it is the state's own value, but where a
+        log with a channel of that state drives a fit (`follow_readings`).
     recipe : Recipe, optional
         How it is made with other parts.
     drive_offset_s : float
@@ -139,6 +143,7 @@ class Plant:
     sticks: bool = False
     sampling: Sampling | None = field(default=None, repr=False)
     clock: str | None = None
+    followed: Mapping[str, Reading] = field(default_factory=dict[str, Reading], repr=False)
     recipe: Recipe | None = field(default=None, repr=False)
     drive_offset_s: float = field(default=0.0, repr=False)
     t: Any = field(init=False, repr=False)
@@ -158,6 +163,7 @@ class Plant:
             spaces.append(SimpleNamespace(**symbols))
             put(self, key, ca.vertcat(*symbols.values()) if symbols else ca.SX(0, 1))
         x, u, p = spaces
+        _add_readings(self, x, u)
         for name, friction in self.friction.items():
             check_loads(self, name, friction, spaces)
             setattr(u, name, friction.force_at(x, u, p))
@@ -188,6 +194,11 @@ class Plant:
     def defaults(self) -> ParameterSet:
         """The parameters that have a default value."""
         return ParameterSet(default for default in self.parameters.values() if isinstance(default, Parameter))
+
+    @property
+    def read_inputs(self) -> tuple[str, ...]:
+        """The inputs that are readings of a log: the last ones, of a plant that follows them."""
+        return tuple(name for name in self.followed if name in self.inputs)
 
     def parameter_unit(self, name: str) -> str:
         """Return the SI unit of a parameter."""
@@ -444,7 +455,23 @@ def name_parameters(plant: Plant, p: Any) -> SimpleNamespace:
 def name_symbols(plant: Plant, x: Any, u: Any, p: Any) -> tuple[SimpleNamespace, ...]:
     """Return vectors of states, inputs and parameters as the namespaces that a plant's roles take."""
     vectors = ((plant.states, x), (plant.inputs, u), (plant.parameters, p))
-    return tuple(SimpleNamespace(**dict(zip(names, ca.vertsplit(v), strict=True))) for names, v in vectors)
+    spaces = tuple(SimpleNamespace(**dict(zip(names, ca.vertsplit(v), strict=True))) for names, v in vectors)
+    _add_readings(plant, *spaces[:2])
+    return spaces
+
+
+def _add_readings(plant: Plant, x: SimpleNamespace, u: SimpleNamespace) -> None:
+    """Give the inputs the states that stand among them, but for those that are inputs."""
+    for name, reading in plant.followed.items():
+        if name not in plant.inputs:
+            setattr(u, name, getattr(x, reading.state))
+
+
+@memo
+def follow_readings(plant: Plant) -> Plant:
+    """Return a plant to which its readings are inputs, the last ones: what sensors have read of its states."""
+    more = {name: plant.states[reading.state] for name, reading in plant.followed.items()}
+    return replace(plant, inputs={**plant.inputs, **more}) if more else plant
 
 
 @memo

@@ -71,6 +71,16 @@ class Sensing:
     still: tuple[str, ...] = option("Outputs that stay at zero, as the motion of a link does that is held.", default=())
 
 
+@record
+class Reading:
+    """A state whose place an estimation may give to what a sensor on it has read: the wave that is in f passes many
+    crests, which a simulated state that is off by one of them would take for one another.
+    """
+
+    state: str
+    wave: str  # parameter: the phase (rad) that one unit of the state makes
+
+
 @record(eq=False)
 class SeriesSpring:
     """The elastic element."""

@@ -15,7 +15,7 @@ from seaopt.problem.problem import Problem
 from seaopt.problem.reading import make_problem
 from seaopt.problem.schema import ProblemTable
 
-DIGITS = 4  # of the values from which the changed problem's fit starts
+DIGITS = 6  # of the values from which the changed problem's fit starts: a wave number has to hold over all waves
 
 
 def find_explanation(fit: Fit) -> HypothesisTrial | None:

@@ -63,7 +63,7 @@ def _count_delayed(model: Model, point: Point) -> int:
     clock = point.clock
     if model.linear:
         return len(clock.lags) - 1 if clock.split or clock.hold == "first" else 0
-    return clock.delay_free * (2 if clock.hold == "first" else 1)
+    return clock.delay_free * (2 if clock.hold == "first" or model.reads else 1)
 
 
 def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool) -> str:
@@ -85,7 +85,7 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
     if model.linear:
         constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
     else:
-        constants["NQ"] = model.np
+        constants |= {"NQ": model.np, "READ": model.reads}
     if constants["STEPPED"]:
         step, output = step_function(model), output_function(model)
         plain = [_drop_derivatives(step, "seaopt_plain_step"), _drop_derivatives(output, "seaopt_plain_output")]

@@ -31,7 +31,7 @@ Trajectory = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Floa
 @np.errstate(all="ignore")  # a plant that overflows gives numbers that are not finite, as the compiled pass does
 def interpret_pass(model: Model, segment: Segment, point: Point, weights: Weights, stop: int, x0: VectorX) -> Pass:
     """Run the samples before `stop` in NumPy and CasADi's virtual machine; keep outputs, columns and states."""
-    layout, forcing = layout_of(model.nx, model.ny, model.np, point), _inputs_in_force(segment, point)[:stop]
+    layout, forcing = layout_of(model.nx, model.ny, model.np, point), _inputs_in_force(model, segment, point)[:stop]
     if model.linear and point.correction is None:
         y, dy, x = _linear_trajectory(model, layout, point, forcing, x0)
     else:
@@ -62,12 +62,18 @@ def _loss_and_weight(r: VectorN, loss: str, knee: float) -> tuple[VectorN, Vecto
     )
 
 
-def _inputs_in_force(segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
-    """Return [u_a, u_b, ..., 1] of every sample."""
+def _inputs_in_force(model: Model, segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
+    """Return [u_a, u_b, ..., 1] of every sample; of a nonlinear plant that follows readings, also the inputs of the
+    four samples around.
+    """
     n, u = segment.n, np.column_stack(segment.u)
     rows = segment.lead + np.arange(n)
-    inputs = (u[np.clip(rows - lag, 0, len(u) - 1)] for lag in point.clock.lags)
+    inputs = (u[np.clip(rows - lag, 0, len(u) - 1)] for lag in _list_lags(model, point))
     return np.hstack([*inputs, np.ones((n, 1))])
+
+
+def _list_lags(model: Model, point: Point) -> tuple[int, ...]:
+    return point.clock.lags + ((1, 0, -1, -2) if model.reads and not model.linear else ())
 
 
 def _linear_trajectory(
@@ -109,10 +115,11 @@ def _run_abreast(
     return z[:ABREAST].reshape(ABREAST, nx, count, nc).transpose(2, 0, 1, 3).reshape(-1, nx, nc)[:n]
 
 
-def _split(model: Model, scheme: _Scheme, w: Any) -> tuple[Any, list[Any]]:
-    """Return t and the inputs in force of a sample's data."""
+def _split(model: Model, scheme: _Scheme, w: Any) -> tuple[Any, list[Any], list[Any]]:
+    """Return t, the inputs in force, and those of the samples around, of a sample's data."""
     nu = model.nu
-    return w[0], [w[1 + i * nu : 1 + (i + 1) * nu] for i in range(scheme.inputs)]
+    rows = [w[1 + i * nu : 1 + (i + 1) * nu] for i in range(scheme.rows)]
+    return w[0], rows[: scheme.inputs], rows[scheme.inputs :]
 
 
 def _blocks(model: Model, scheme: _Scheme, data: Any) -> list[Any]:
@@ -129,16 +136,18 @@ class _Scheme:
     delay_free: bool
     fractional: bool  # older inputs act for the first part of a period
     inputs: int  # in force
+    rows: int  # of inputs, in a sample's data
     substeps: int
 
     @classmethod
-    def of(cls, point: Point) -> _Scheme:
+    def of(cls, model: Model, point: Point) -> _Scheme:
         clock = point.clock
         return cls(
             hold=clock.hold,
             delay_free=clock.delay_free,
             fractional=clock.fraction_s > 0.0,
             inputs=len(clock.lags),
+            rows=len(_list_lags(model, point)),
             substeps=point.substeps,
         )
 
@@ -146,7 +155,7 @@ class _Scheme:
 def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
     """Return the state and its derivatives one sample on."""
     steps, nx, nu = scheme.substeps, model.nx, model.nu
-    t, inputs = _split(model, scheme, w)
+    t, inputs, read = _split(model, scheme, w)
     x, s = z[:, 0], z[:, 1:]
     padding = ca.MX.zeros(nx, layout.states - 1 - model.np - scheme.delay_free)
     if model.linear:
@@ -160,10 +169,16 @@ def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
         base = inputs[0] if joined or part else inputs[1]
         slope = (inputs[1] - inputs[0] if part else inputs[0] - inputs[-1]) / period if joined else ca.MX.zeros(nu)
         for i in range(steps) if part else range(-steps, 0):  # the older line ends at u_a, the newer begins there
-            x, a, b = step(t, x, base + slope * h * i, base + slope * h * (i + 1), p, h)
+            ends, moved = [base + slope * h * k for k in (i, i + 1)], [slope * dh * k for k in (i, i + 1)]
+            for end, k in enumerate((i, i + 1)) if read else ():
+                curve, rate = _follow(read, (data[-2] + h * k) / period)
+                ends[end] = _put_readings(model, ends[end], curve)
+                # The delay moves where steps begin on a reading's curve.
+                moved[end] = _put_readings(model, moved[end], rate * (1.0 + dh * k) / period)
+            x, a, b = step(t, x, *ends, p, h)
             forced = [b[:, : model.np]]
             if scheme.delay_free:
-                along = ca.vertcat(dh, slope * dh * i, slope * dh * (i + 1))
+                along = ca.vertcat(dh, *moved)
                 forced.append(ca.mtimes(b[:, model.np :], along))
             s = ca.mtimes(a, s) + ca.horzcat(*forced, padding)
             t = t + h
@@ -174,9 +189,23 @@ def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
     return after
 
 
+def _follow(read: list[Any], s: Any) -> tuple[Any, Any]:
+    """Return the inputs at a place s in the period and their rates per period, of a curve through samples around."""
+    before, now, after, later = read
+    c1, c3 = 0.5 * (after - before), 0.5 * (later - before) + 1.5 * (now - after)
+    c2 = after - now - c1 - c3
+    return now + s * (c1 + s * (c2 + s * c3)), c1 + s * (2.0 * c2 + 3.0 * s * c3)
+
+
+def _put_readings(model: Model, inputs: Any, readings: Any) -> Any:
+    """Return inputs with the last ones, which are readings, in their place."""
+    first = model.nu - model.reads
+    return ca.vertcat(inputs[:first], readings[first:])
+
+
 def _observe(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
     """Return the outputs and their derivatives."""
-    t, inputs = _split(model, scheme, w)
+    t, inputs, read = _split(model, scheme, w)
     x, s = z[:, 0], z[:, 1:]
     if model.linear:
         blocks, v = [block[model.nx :, :] for block in _blocks(model, scheme, data)], ca.vertcat(x, *inputs, 1.0)
@@ -187,6 +216,8 @@ def _observe(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data
         if scheme.hold == "first":
             du = (inputs[-1] - inputs[0]) / (data[-2] + data[-1]) if scheme.inputs == 3 else du
             u = inputs[0] + data[-2] * du
+        if read:
+            u, du = _put_readings(model, u, read[1]), _put_readings(model, du, ca.MX.zeros(model.nu))
         y, c, d, by_input = output_function(model)(t, x, u, data[:-2])
         direct = [d, ca.mtimes(by_input, du)] if scheme.delay_free else [d]
     count = sum(block.shape[1] for block in direct)
@@ -226,7 +257,7 @@ def _program(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, in
     y = _observe(model, scheme, layout, z, w, plant)
     after = _advance(model, scheme, layout, z, w, plant)
     if layout.corrected:
-        after = after - _correct(layout, z, y, w[1 + scheme.inputs * model.nu :], data[sizes[1] :])
+        after = after - _correct(layout, z, y, w[1 + scheme.rows * model.nu :], data[sizes[1] :])
     return ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
 
 
@@ -264,7 +295,7 @@ def _folded_trajectory(
     model: Model, segment: Segment, point: Point, forcing: Float[np.ndarray, "n w"], x0: VectorX
 ) -> Trajectory:
     """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
-    layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(point)
+    layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(model, point)
     clock, time = point.clock, segment.start_s + point.clock.period * np.arange(len(forcing))
     if model.linear:
         data = transition(model, point.theta, clock).ravel()

@@ -91,6 +91,11 @@ class Model:
         return max(len(self.plant.inputs), 1)
 
     @property
+    def reads(self) -> int:
+        """How many of the inputs, the last ones, are readings of a log: of its own time, and joined by curves."""
+        return len(self.plant.read_inputs)
+
+    @property
     def ny(self) -> int:
         """Number of outputs."""
         return len(self.outputs)

@@ -431,7 +431,26 @@ INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict
         du[i] = foh ? (older[i] - u[i]) / m[1] : 0.0;
         u[i] += m[2] * du[i];
     }
+    for (int i = NU - READ; i < NU; i++) {
+        u[i] = a->u[i][k];
+        du[i] = 0.0;
+    }
     output(q, t, u, du, m + SETTINGS, out, wide);
+}
+
+/* A reading at a place s in the period, 0 to 1, with du per unit of s: the cubic through both samples that has there the
+   slopes between their neighbours (Catmull and Rom 1974). */
+static inline double follow(const seaopt_pass_args *a, long k, int c, double s, double *du) {
+    double w[4];
+    for (int i = 0; i < 4; i++) {
+        long row = k - 1 + i;
+        if (row < -a->lead) row = -a->lead;
+        if (row >= a->length) row = a->length - 1;
+        w[i] = a->u[c][row];
+    }
+    const double c1 = 0.5 * (w[2] - w[0]), c3 = 0.5 * (w[3] - w[0]) + 1.5 * (w[1] - w[2]), c2 = w[2] - w[1] - c1 - c3;
+    *du = c1 + s * (2.0 * c2 + 3.0 * s * c3);
+    return w[1] + s * (c1 + s * (c2 + s * c3));
 }
 
 /* With a fractional delay the older input acts first, for m[2] seconds: u_b held, or the line from u_c to u_a; then u_a
@@ -463,6 +482,13 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
                 in.u1[c] = base + slope * h * (from + 1);
                 in.du0[c] = slope * dh * from;
                 in.du1[c] = slope * dh * (from + 1);
+            }
+            for (int c = NU - READ; c < NU; c++) { /* the delay moves where steps begin on a reading's curve */
+                const long from = part ? i : i - count;
+                in.u0[c] = follow(a, k, c, (m[2] + h * from) / m[1], &in.du0[c]);
+                in.u1[c] = follow(a, k, c, (m[2] + h * (from + 1)) / m[1], &in.du1[c]);
+                in.du0[c] *= (1.0 + dh * from) / m[1];
+                in.du1[c] *= (1.0 + dh * (from + 1)) / m[1];
             }
             one_step(q, t, &in, m + SETTINGS, h, dh, wide);
             t += h;

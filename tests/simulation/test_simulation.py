@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import butter
 
 import seaopt as so
 from seaopt.errors import LogError, SimulationError
+from seaopt.plants.plant import follow_readings
 from seaopt.simulation import (
     Clock,
     Layout,
@@ -78,6 +80,10 @@ CASES = {
         {"f_c": 20.0, "f_s": 30.0, "v_s": 0.02, "v_st": 0.05, "g_b": 2e-5, "eps_b": 1e-5, "k_3": 1e11, "c_k": 50.0},
     ),
 }  # fmt: skip
+
+
+COGGING = {"f_c": 40.0, "v_s": 5e-3, "a_g": 30.0, "b_g": -20.0, "n_g": 1500.0}
+FOLLOWS = {"follows": (follow_readings(so.plants.moving_output(parts=("cogging",))), COGGING)}
 
 
 @pytest.mark.parametrize("hold", ["zero", "first"])
@@ -177,18 +183,51 @@ def test_a_late_input_of_straight_lines_is_dop853s(name, delay_s, thor):
         np.testing.assert_allclose(run[output], wanted, atol=1e-6 * np.max(np.abs(wanted)), rtol=0)
 
 
+@pytest.mark.parametrize("delay_s", [0.0, 0.0007, 0.0062])
+def test_a_reading_is_of_the_logs_own_time_whatever_the_delay(delay_s, thor):
+    """The command comes late and is held; the position in the cogging's phase is scipy's Hermite spline of samples."""
+    plant, changes = FOLLOWS["follows"]
+    params = plant.complete(thor).update(**changes)
+    rng, n = np.random.default_rng(6), 40
+    time, u, read = np.arange(n) / RATE, 3 * rng.normal(size=n), 2e-3 * np.sin(0.3 * np.arange(n))
+    ends = np.r_[read[0], read, read[-1]]
+    curve = CubicHermiteSpline(time, read, 0.5 * RATE * (ends[2:] - ends[:-2]))
+    p, x = plant.complete(params).vector, np.zeros(len(plant.states))
+    arguments = (plant.t, plant.x, plant.u, plant.p)
+    f, h = (compile_expression(arguments, expression) for expression in (plant.dynamics, plant.output))
+    corners = np.unique(np.round(np.r_[time, (time + delay_s)[time + delay_s < time[-1]]], 12))
+    expected = []
+    for start, end in zip(corners, [*corners[1:], corners[-1]], strict=True):
+        late = u[max(int(np.floor((start - delay_s) * RATE + 1e-9)), 0)]
+        if np.min(np.abs(time - start)) < 1e-11:
+            before = u[max(int(np.ceil((start - delay_s) * RATE - 1e-9)) - 1, 0)] if delay_s else late
+            expected.append(h(start, x, np.r_[before, curve(start)], p))
+        if end > start:
+            x = solve_ivp(
+                lambda t, x, late=late: f(t, x, np.r_[late, curve(t)], p), (start, end), x,
+                method="DOP853", rtol=1e-10, atol=1e-13,
+            ).y[:, -1]  # fmt: skip
+    model, clock = make_model(plant, params), Clock(period=1 / RATE, delay_s=delay_s)
+    ny = len(plant.outputs)
+    point = Point(theta=np.zeros(0), offset=np.zeros(ny), gain=np.ones(ny), clock=clock, substeps=64)
+    y = run_passes(model, Segment(u=(u, read)), point, np.zeros(model.nx), sums=False, outputs=True).outputs
+    size = np.max(np.abs(expected), axis=0)
+    assert np.all(np.abs(y[:-1] - np.array(expected)[:-1]) < 1e-5 * size)
+
+
 def passes(case, thor, *, clock=None, filtered=False, n=700, free=("J", "b_r", "eta"), loss="square", corrected=False):
-    plant, changes = CASES[case]
-    params = thor.update(**changes)
-    free = (*free, "f_c") if changes.get("f_c") else free
+    plant, changes = (CASES | FOLLOWS)[case]
+    params = plant.complete(thor).update(**changes)
+    free = (*free, *(name for name in ("f_c", "a_g", "n_g") if changes.get(name)))
     model = make_model(plant, params, free, ("F1", "F2"))
     rng = np.random.default_rng(2)
     y = 300 * rng.normal(size=(n, 2))
     y[7, 1] = np.nan
     keep = np.ones((n, 2), dtype=np.uint8)
     keep[100:120] = 0
+    read = tuple(2e-3 * np.sin(0.3 * np.arange(n)) for _ in plant.read_inputs)
     segment = Segment(
-        u=(rng.normal(size=n),), y=tuple(y.T.copy()), keep=tuple(keep.T.copy()), drift_span=(-1.0, 2.0 / n)
+        u=(rng.normal(size=n), *read), y=tuple(y.T.copy()), keep=tuple(keep.T.copy()), drift_span=(-1.0, 2.0 / n)
     )
     clock = clock or Clock(period=1 / RATE)
     correction = None
@@ -226,7 +265,7 @@ SETTINGS = [
     ("case", "options"),
     [
         pytest.param(case, options, marks=pytest.mark.slow if case == "swing" or number in others else ())
-        for case, others in (("stand", ()), ("swing", ()), ("swing friction", (3, 5, 6)))
+        for case, others in (("stand", ()), ("swing", ()), ("swing friction", (3, 5, 6)), ("follows", (0, 1, 2, 5, 7)))
         for number, options in enumerate(SETTINGS)
     ],
 )
@@ -255,8 +294,11 @@ def test_without_a_compiler_a_short_run_takes_its_samples_and_no_others(thor, mo
     np.testing.assert_allclose(pieces.columns, whole.columns, rtol=1e-12, atol=1e-12 * np.max(np.abs(whole.columns)))
 
 
-@pytest.mark.parametrize("case", ["stand", "swing friction"])
-@pytest.mark.parametrize("options", SETTINGS)
+@pytest.mark.parametrize(
+    ("case", "options"),
+    [(case, options) for case in ("stand", "swing friction") for options in SETTINGS]
+    + [("follows", SETTINGS[number]) for number in (3, 6)],
+)
 def test_derivatives_are_finite_differences(case, options, thor):
     """Every column of v: shared, initial state, each output's own. The correction moves as it says it does."""
     model, segment, point, weights, x0 = passes(case, thor, n=250, **options)

@@ -28,7 +28,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import remembers
 from seaopt.plants.memo import memo
 from seaopt.plants.plant import jacobians
-from seaopt.plants.roles import Friction
+from seaopt.plants.roles import Friction, with_values
 from seaopt.signals import MatrixMN, MatrixNN, VectorN
 
 PLACES = 4  # states, inputs and parameters at random where the equations are looked at
@@ -126,6 +126,9 @@ def _take_out(plant: Plant, shifts: Mapping[str, Any], telling: set[str]) -> Pla
     def fill(x: Any) -> SimpleNamespace:
         return SimpleNamespace(**{**vars(x), along: zero})
 
+    there = {name: reading for name, reading in plant.followed.items() if reading.state != along}
+    gone = dict.fromkeys(plant.followed.keys() - there.keys(), zero)
+
     def settle(expression: Any) -> Any:
         return ca.substitute(ca.SX(expression), zero, 0.0)
 
@@ -138,7 +141,7 @@ def _take_out(plant: Plant, shifts: Mapping[str, Any], telling: set[str]) -> Pla
         )
 
     def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        rates = {name: settle(rate) for name, rate in plant.f(t, fill(x), u, p).items()}
+        rates = {name: settle(rate) for name, rate in plant.f(t, fill(x), with_values(u, gone), p).items()}
         together = rates.pop(along)
         values = ratios(ca.vertcat(*(getattr(p, name) for name in plant.parameters)))
         for i, name in enumerate(coupled):
@@ -146,7 +149,11 @@ def _take_out(plant: Plant, shifts: Mapping[str, Any], telling: set[str]) -> Pla
         return rates
 
     def h(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
-        return {name: settle(value) for name, value in plant.h(t, fill(x), u, p).items() if name not in telling}
+        return {
+            name: settle(value)
+            for name, value in plant.h(t, fill(x), with_values(u, gone), p).items()
+            if name not in telling
+        }
 
     return replace(
         plant,
@@ -158,6 +165,7 @@ def _take_out(plant: Plant, shifts: Mapping[str, Any], telling: set[str]) -> Pla
         sensing=None,
         mode=None,
         derived=None,
+        followed=there,
         states={name: unit for name, unit in plant.states.items() if name != along},
         outputs={name: unit for name, unit in plant.outputs.items() if name not in telling},
         friction={name: relative(friction) for name, friction in plant.friction.items()},

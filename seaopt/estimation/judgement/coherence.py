@@ -83,7 +83,7 @@ def _gather(
     delay = round(experiment.slots.delay.value / experiment.period)
     for segment, left in zip(experiment.segments, residuals.segments, strict=True):
         samples = segment.samples
-        u = np.stack(samples.inputs, axis=1)
+        u = np.stack(samples.inputs[: max(len(experiment.data.plant.inputs), 1)], axis=1)  # no readings
         if delay:
             u = np.concatenate([np.repeat(u[:1], min(delay, len(u)), axis=0), u[: max(len(u) - delay, 0)]])
         used = segment.mark_counted(0)

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
-from seaopt.estimation.judgement.ripple_search import find_ripple, read_position
-from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.judgement.ripple_search import find_ripple, move_zero
+from seaopt.estimation.problem.experiment import Experiment, is_fine
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.formatting import join_words
@@ -267,9 +267,11 @@ def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment)
     if position and position in plant.states and len(left.segments) == len(experiment.log.segments):
         minimum = fit.require_minimum("_measure")
         posed = next(e for e in minimum.problem.experiments if e.name == experiment.name)
-        measured = read_position(posed, minimum.z)
-        place = run[position] if measured is None else measured[longest]
+        read = position in log.signals
+        place = experiment.read(position)[longest] if read else run[position]
         ripple = find_ripple(posed, left, fit.parameters, place, number)
+        if ripple and read and not (plant.moves and is_fine(experiment.log, position, ripple["n_g"])):
+            ripple = move_zero(posed, minimum.z, ripple, position)
     dry = 0.0 if friction is None or friction.jump is None else friction.jump(0.0, friction.add_rated(values))
     return Sizes(
         current=_find_largest(current),

@@ -96,15 +96,15 @@ class Refit:
         """The lines of a problem file that add its parts to a plant NAME, with their parameters."""
         recipe = self.change.experiments[0].plant.recipe
         parts = dict.fromkeys((*(recipe.parts if recipe else ()), *self.change.parts))
-        rows = [f"{name} = {{ value = {value:.4g}, free = true }}" for name, value in self.frees.items()]
-        rows += [f"{name} = {value:.4g}" for name, value in self.fixed.items()]
+        rows = [f"{name} = {{ value = {value:g}, free = true }}" for name, value in self.frees.items()]
+        rows += [f"{name} = {value:g}" for name, value in self.fixed.items()]
         listed = ", ".join(f'"{part}"' for part in parts)
         return "\n".join(["[plant.NAME]", f"parts = [{listed}]", *state_sticking(parts), "[parameters]", *rows])
 
     @property
     def python(self) -> str:
         """The calls that add them to a plant and its parameters."""
-        given = ", ".join(f"{name}={value:.4g}" for name, value in {**self.frees, **self.fixed}.items())
+        given = ", ".join(f"{name}={value:g}" for name, value in {**self.frees, **self.fixed}.items())
         free = ", ".join(f'"{name}"' for name in self.frees)
         lines = [f'plant = so.plants.add_part(plant, "{part}")' for part in self.change.parts]
         lines += [f"params = plant.defaults.with_parameters(*params.values()).update({given}).free({free})"]

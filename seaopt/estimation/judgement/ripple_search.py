@@ -86,15 +86,14 @@ def find_ripple(
     return {"a_g": a, "b_g": b, "n_g": float(best)} if share > max(LEAST, OF_CHANCE / position.size) else {}
 
 
-def read_position(experiment: FitExperiment, z: Vector) -> Float[np.ndarray, " samples"] | None:
-    """Return the motor's position as a log has it, without the sensor's gain and offset; None where it has none."""
-    data, point = experiment.data, experiment.point(z)
-    name = data.plant.sensing.motor_position if data.plant.sensing else None
-    if name not in data.outputs:
-        return None
-    i, there = data.outputs.index(name), np.isfinite(data.log[name])
-    measured = (data.log[name][there] - point.offset[i]) / point.gain[i]
-    return np.interp(data.log.time, data.log.time[there], measured)
+def move_zero(experiment: FitExperiment, z: Vector, ripple: Mapping[str, float], state: str) -> Mapping[str, float]:
+    """Return a ripple over what a sensor reads as it is over the state, from which its offset is unknown."""
+    if not ripple or state not in experiment.data.outputs:
+        return ripple
+    i = experiment.data.outputs.index(state)
+    offset = experiment.point(z).offset[i] - experiment.slots.offset[i].value
+    turned = complex(ripple["a_g"], ripple["b_g"]) * np.exp(1j * ripple["n_g"] * offset)
+    return {**ripple, "a_g": float(turned.real), "b_g": float(turned.imag)}
 
 
 def _list_waves(

@@ -17,8 +17,10 @@ from seaopt.formatting import format_count
 from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
 from seaopt.logs.quality.channel import BEYOND
+from seaopt.logs.quality.faults import find_quantisation
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.plant import follow_readings
 from seaopt.plants.sensors.difference import Difference, add_difference, find_state
 from seaopt.records import record
 from seaopt.simulation import Hold, Segment
@@ -29,6 +31,10 @@ EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
+FEWEST_READ, ROUGH = (
+    16,
+    0.3,
+)  # samples that tell a reading's noise, and how much of it, rad of a wave, takes 4 % of that
 Mask = Literal["auto", "declared", "none"]
 # The values of a setting, and how to name them.
 CHOICES = {
@@ -170,6 +176,27 @@ class Experiment:
             value = value.value if isinstance(value, Parameter) else float(value)
             local.append(Parameter(name=name, value=value, unit=self.plant.parameter_unit(name)))
         return params.with_parameters(*local)
+
+    def follow(self, params: ParameterSet) -> Plant:
+        """Return the plant as it is simulated in a fit: where a link moves it follows the positions that the log has
+        finely enough. A link that is held holds the simulated position near the measured one, by its spring.
+        """
+        plant = self.plant
+        if not plant.followed or not plant.moves:
+            return plant
+        values = plant.complete(self.apply_own(params))
+        fine = all(is_fine(self.log, each.state, values[each.wave].value) for each in plant.followed.values())
+        return follow_readings(plant) if fine else plant
+
+    def read(self, state: str) -> Signal:
+        """Return what a sensor has read of a state, without the gain and the offset that are known of it; a line where
+        samples are missing.
+        """
+        offset = self.offset.get(state, 0.0) if isinstance(self.offset, Mapping) else 0.0
+        gain = self.gain.get(state, 1.0)
+        values, there = self.log[state], np.isfinite(self.log[state])
+        whole = np.interp(self.log.time, self.log.time[there], values[there])
+        return (whole - offset) / (gain.value if isinstance(gain, Parameter) else gain)
 
     def _add_differences(self) -> None:
         """Give the plant the outputs that are differences; one of theirs that it has already is there to stay."""
@@ -347,9 +374,13 @@ class Experiment:
                 notes.append(f"{a} and {b} are the same samples: {text}")
         return tuple(notes)
 
-    def segments(self, holdout: float = 0.0) -> list[Segment]:
-        """Return the segments that are simulated; the last fraction `holdout` of the time gets no weight."""
+    def segments(self, holdout: float = 0.0, plant: Plant | None = None) -> list[Segment]:
+        """Return the segments that are simulated, of the plant that `follow` made if that is given; the last fraction
+        `holdout` of the time gets no weight.
+        """
         u = input_samples(self.plant, self.log)
+        if plant is not None:
+            u += tuple(self.read(plant.followed[name].state) for name in plant.read_inputs)
         y = tuple(self.log[name] for name in self.outputs)
         time, first, duration = self.log.time, float(self.log.time[0]), self.log.duration_s
         used = (np.arange(len(self.log)) < self.count_fitted(holdout)).astype(np.uint8) if holdout else None
@@ -380,6 +411,15 @@ class Experiment:
     def _cuts(self, whole: slice) -> list[int]:
         """Return the rows at which a segment of the log is cut into shots, its ends included."""
         return (whole.start + cut_into_shots(whole.stop - whole.start, self.shots)).tolist()
+
+
+def is_fine(log: Log, state: str, wave: float) -> bool:
+    """Tell whether a log has a state, with noise and steps of a small part of a wave of so many radians per unit."""
+    values = log[state][np.isfinite(log[state])] if state in log.signals else np.zeros(0)
+    if values.size < FEWEST_READ or is_constant(values):
+        return False
+    third = 1.4826 * float(np.median(np.abs(np.diff(values, 3)))) / np.sqrt(20.0)  # of white noise; motion is slower
+    return wave * max(third, find_quantisation(values) / np.sqrt(12.0)) <= ROUGH
 
 
 def is_constant(values: Signal) -> bool:

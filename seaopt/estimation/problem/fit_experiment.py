@@ -300,7 +300,7 @@ def model_experiment(
     rows = zip(slots.offset, slots.drift, slots.gain, strict=True)
     sensors = [_indices([offset, *drift, gain]) for offset, drift, gain in rows]
     segments: list[FitSegment] = []
-    for samples, initial in zip(data.segments(holdout), slots.initial, strict=True):
+    for samples, initial in zip(data.segments(holdout, model.plant), slots.initial, strict=True):
         state = _indices(initial)
         together = np.array([*shared, *noise, *state, *chain.from_iterable(sensors)], dtype=int)
         segments.append(

@@ -179,7 +179,7 @@ def _make_model(experiment: Experiment, params: ParameterSet) -> Model:
     """Return an experiment's model in what is free of its plant, for all logs or for this one."""
     shared = [name for name in params.free_names if name not in experiment.parameters]
     local = [name for name, parameter in experiment.list_own().items() if parameter.name in params.free_names]
-    return make_model(experiment.plant, experiment.apply_own(params), (*shared, *local), experiment.outputs)
+    return make_model(experiment.follow(params), experiment.apply_own(params), (*shared, *local), experiment.outputs)
 
 
 def find_places(experiment: Experiment, model: Model, names: Sequence[str]) -> list[int]:

@@ -307,7 +307,9 @@ class Fit(Result, Worded):
                     f"give {name} a value, or fit it with this log"
                 )
         nuisance, in_band = self._find_nuisance(experiment)
-        model = make_model(experiment.plant, experiment.apply_own(self.parameters), (), experiment.outputs)
+        model = make_model(
+            experiment.follow(self.parameters), experiment.apply_own(self.parameters), (), experiment.outputs
+        )
         n = len(experiment.log)
         y = np.full((n, len(experiment.outputs)), np.nan)
         point = Point(
@@ -318,7 +320,9 @@ class Fit(Result, Worded):
             drift=np.array([nuisance.drift.get(name, ()) for name in experiment.outputs]),
             substeps=nuisance.substeps,
         )
-        segments = zip(experiment.segments(), experiment.segment_rows, nuisance.initial_state, strict=True)
+        segments = zip(
+            experiment.segments(plant=model.plant), experiment.segment_rows, nuisance.initial_state, strict=True
+        )
         for segment, rows, state in segments:
             start = np.array(list(state.values()))
             outputs = run_passes(model, segment, point, start, sums=False, outputs=True).outputs

@@ -92,7 +92,7 @@ ARGUMENTS = {
 def store_plant(plant: Any) -> dict[str, Any]:
     """Return what a `Plant` is made of, with every function of its names_of as a `StoredFunction`."""
     spaces: dict[str, Any] = {"t": "t", "v": "velocity", "z": "z", "x": tuple(plant.states)}
-    spaces |= {"u": (*plant.inputs, *plant.friction), "p": tuple(plant.parameters)}
+    spaces |= {"u": (*plant.inputs, *plant.friction, *plant.followed), "p": tuple(plant.parameters)}
 
     def store(owner: Any, loads: Iterable[str] = ()) -> dict[str, Any]:
         """Return the functions of a plant or a role that do not pickle as they are, stored."""

@@ -24,7 +24,8 @@ Parts of `seaopt.plants.parts`; each is nothing where its parameters are zero:
     them times :math:`1 + d_e` move alike.
 ``cogging``
     A force on the motor that its position alone decides, :math:`a_g \sin(n_g \theta) + b_g \cos(n_g \theta)`, of
-    magnets that meet slots, or of balls that meet a groove.
+    magnets that meet slots, or of balls that meet a groove. Where a log has the position, a fit takes it from there: a
+    simulated one that is off by a wave has a minimum of its own. The phase is then that of the encoder's zero.
 ``stand``
     What holds the spring gives, :math:`c_t` per unit of its effort, so that spring and stand are in series:
     :math:`k/(1 + k c_t)` is what a held link feels.
@@ -44,7 +45,7 @@ from seaopt.errors import PlantError
 from seaopt.parameters import Parameter, declare
 from seaopt.plants.friction import bound_slopes
 from seaopt.plants.plant import Plant, extend, refuse_clash
-from seaopt.plants.roles import Friction, SeriesSpring, change_ports, put_behind, with_values
+from seaopt.plants.roles import Friction, Reading, SeriesSpring, change_ports, put_behind, with_values
 from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
 
 ELAPSED = "elapsed"  # the input that is the time since a log's beginning
@@ -216,11 +217,16 @@ def let_cog(plant: Plant) -> Plant:
             "sensing = Sensing(regulated, motor_position=...)"
         )
 
+    read = f"{position}_read"
+    refuse_clash(plant, "cogging", (read,))
+
     def push(x: Any, u: Any, p: Any) -> SimpleNamespace:
-        phase = p.n_g * getattr(x, position)
+        phase = p.n_g * getattr(u, read)
         return with_values(u, {name: getattr(u, name) + p.a_g * ca.sin(phase) + p.b_g * ca.cos(phase)})
 
-    return _change(plant, "cogging", _cogging_parameters(mechanics_of(friction.unit)), push, let_cog)
+    followed = {**plant.followed, read: Reading(state=position, wave="n_g")}
+    parameters = _cogging_parameters(mechanics_of(friction.unit))
+    return _change(plant, "cogging", parameters, push, let_cog, followed=followed)
 
 
 def let_stand_give(plant: Plant) -> Plant:

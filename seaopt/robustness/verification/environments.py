@@ -143,6 +143,7 @@ def attach_environment(plant: Plant) -> Plant:
         f=lambda t, x, u, p: probe.f(t, x, pull(x, u, p), p),
         h=lambda t, x, u, p: probe.h(t, x, pull(x, u, p), p),
         friction=probe.friction,
+        followed=probe.followed,
         ports=(replace(probe.ports[0], effort=None),),
         drive_offset_s=plant.drive_offset_s,
     )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.estimation.judgement.ripple_search import find_ripple, read_position
+from seaopt.estimation.judgement.ripple_search import find_ripple
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
@@ -176,6 +176,6 @@ def test_a_wave_number_is_found_where_the_model_has_the_motor_elsewhere():
     params = plant.defaults.update(**given).free("J_m", "f_c")
     (posed,) = pose_problem((experiment,), params, loss=Squares()).with_each(substeps=10).experiments
     z = np.array([given["J_m"], given["f_c"]])
-    left, position = compute_experiment_residuals(posed, z), read_position(posed, z)
+    left, position = compute_experiment_residuals(posed, z), experiment.read("theta_m")
     assert wave * np.std(left.raw[:, 0]) > 3.0
     assert find_ripple(posed, left, params, position, 0)["n_g"] == pytest.approx(wave, rel=1e-3)

@@ -1,0 +1,115 @@
+"""A motor that cogs behind a pendulum: the refit follows the measured position, as the simulated one is off by waves.
+
+The logs are of a pendulum that is integrated here.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.plants.plant import follow_readings
+from tests.actuator_logs import drive, integrate
+
+RATE_HZ = 400.0
+TRUTH = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 2.0, "N": 100.0, "K_tau": 0.05, "k_s": 300.0, "c_s": 0.0}
+LINK = {"J_l": 0.25, "d_l": 0.3, "m": 2.5, "L": 0.2}
+COGS = {"a_g": 0.006, "b_g": 0.003, "n_g": 42.0}
+ENCODER = 2.0 * math.pi / 4096.0
+
+
+@cache
+def swing(seconds=8.0):
+    """Return current, motor and link of a pendulum whose motor cogs."""
+    p, weight = TRUTH, LINK["m"] * 9.81 * LINK["L"]
+    _, current = drive(seconds, RATE_HZ, 1.2, seed=1, top_hz=8.0)
+
+    def rates(x, ampere):
+        angle, speed, link, turn = x
+        torque = p["k_s"] * (angle / p["N"] - link)
+        phase = COGS["n_g"] * angle
+        rub = p["f_c"] * math.tanh(speed / p["v_s"]) + p["b_r"] * speed
+        rub += COGS["a_g"] * math.sin(phase) + COGS["b_g"] * math.cos(phase)
+        push = p["K_tau"] * ampere - rub - torque / p["N"]
+        return speed, push / p["J_m"], turn, (torque - LINK["d_l"] * turn - weight * math.sin(link)) / LINK["J_l"]
+
+    angle, _, link, _ = integrate(rates, 4, current, 1.0 / RATE_HZ, 40)
+    return current, angle, link
+
+
+def record(*, step=ENCODER):
+    """Return a log of both encoders; `step`: of the motor's."""
+    current, angle, link = swing()
+    noise = np.random.default_rng(2)
+    return so.Log.from_arrays(
+        time=np.arange(angle.size) / RATE_HZ,
+        I=current,
+        theta_m=step * np.round((angle + 0.3 * step * noise.normal(size=angle.size)) / step),
+        theta_l=link + noise.normal(scale=2e-5, size=angle.size),
+    )
+
+
+def pose(log, *, parts=(), **values):
+    """Return an experiment and parameters off by a third."""
+    plant = so.plants.rotary(link="pendulum", parts=parts)
+    params = plant.defaults.update(**TRUTH, **LINK).update(J_m=3.2e-5, k_s=240.0, f_c=0.015, **values)
+    return so.Experiment(plant=plant, log=log, initial_state="rest"), params.free("J_m", "b_r", "f_c", "k_s")
+
+
+def test_cogging_is_found_and_what_follows_is_right():
+    experiment, params = pose(record())
+    best = so.fit([experiment], params).hypotheses[0]
+    assert (best.parts, best.outcome) == (("cogging",), "adopted")
+    assert best.frees["n_g"] == pytest.approx(COGS["n_g"], rel=1e-4)
+    size = math.hypot(best.frees["a_g"], best.frees["b_g"])
+    assert size == pytest.approx(math.hypot(COGS["a_g"], COGS["b_g"]), rel=0.03)
+    for name in ("J_m", "b_r", "f_c", "k_s"):
+        assert best.parameters[name] == pytest.approx(TRUTH[name], rel=0.01), name
+
+
+def test_the_model_with_its_own_position_is_the_same_physics():
+    """What a controller is tuned on has the state in the reading's place: fed with that, both move alike."""
+    plant = so.plants.rotary(link="pendulum", parts=("cogging",))
+    params = plant.defaults.update(**TRUTH, **LINK, **COGS)
+    current, angle, link = swing()
+    times = np.arange(600) / RATE_HZ
+    own = so.simulate(plant, params, so.Log.from_arrays(time=times, I=current[:600]))
+    read = so.Log.from_arrays(time=times, I=current[:600], theta_m_read=own["theta_m"])
+    followed = so.simulate(follow_readings(plant), params, read, rtol=1e-6)
+    assert np.max(np.abs(own["theta_m"] - followed["theta_m"])) < 2e-3 * np.ptp(own["theta_m"])
+    assert np.max(np.abs(own["theta_m"] - angle[:600])) < 1e-3 * np.ptp(angle[:600])
+    assert np.max(np.abs(own["theta_l"] - link[:600])) < 1e-3 * np.ptp(link[:600])
+
+
+@pytest.mark.parametrize(("step", "follows"), [(ENCODER, True), (0.01, True), (0.05, False)])
+def test_a_coarse_reading_is_not_followed(step, follows):
+    """Of 42 waves per rad one of 0.05 rad is 2.1 rad of a wave: the model's own position is better."""
+    experiment, params = pose(record(step=step), parts=("cogging",), **COGS)
+    assert bool(experiment.follow(params).read_inputs) is follows
+
+
+def test_a_log_without_the_position_and_a_held_link_are_not_followed():
+    experiment, params = pose(record(), parts=("cogging",), **COGS)
+    assert experiment.follow(params).read_inputs == ("theta_m_read",)
+    log = experiment.log
+    silent = so.Log.from_arrays(time=log.time, I=log["I"], theta_l=log["theta_l"])
+    assert not replace(experiment, log=silent, outputs=("theta_l",)).follow(params).read_inputs
+    held = so.plants.rotary(link="locked", parts=("cogging",))
+    assert not replace(experiment, plant=held, outputs=("theta_m",)).follow(params).read_inputs
+
+
+def test_a_fit_that_went_through_a_pickle_follows_as_before():
+    experiment, params = pose(record(), parts=("cogging",), **COGS)
+    stored = pickle.loads(pickle.dumps(experiment.plant))
+    fits = [so.fit([replace(experiment, plant=p)], params, diagnostics=False) for p in (experiment.plant, stored)]
+    for name in ("J_m", "b_r", "f_c", "k_s"):
+        assert fits[0].parameters[name].value == pytest.approx(TRUTH[name], rel=0.01), name
+        assert fits[1].parameters[name].value == pytest.approx(fits[0].parameters[name].value, rel=1e-9), name
+    shown = fits[0].predict(experiment)
+    assert np.std(shown.model["theta_m"] - shown.measured["theta_m"]) < 0.01 * np.std(shown.measured["theta_m"])
