@@ -45,16 +45,23 @@ def test_least_times_of_turns_that_alternate(monkeypatch):
     assert calls == ["ours", "theirs"] * 4
 
 
-def test_of_laws_that_were_not_played_none_is_counted_as_right(monkeypatch):
-    """With --exact only refused laws are played."""
+def test_laws_that_logs_refuse_though_they_are_fine_are_counted_with_a_bound(monkeypatch):
     monkeypatch.setattr(sys, "path", sys.path.copy())
     judge = load_script("judge/run", monkeypatch)
-    row = {"fit_met": True, "certified": True, "refused": []}
-    played = row | {"ms": 1.4, "refused": ["log_sensitivity"]}
-    rows = [row, row, played | {"bad": False}, played | {"bad": True}, {"status": "none"}]
+    log = {"outcome": "undecided"}
+    kept = {"fit_met": True, "certified": True, "refused": [], "logs": [log], "ms": 1.4, "limit": 1.785, "bad": False}
+    bad = kept | {"fit_met": False, "ms": 1.9, "bad": True}
+    confirmed = kept | {"logs": [log, {"outcome": "confirmed"}]}
+    refuted = kept | {"refused": ["log_sensitivity"]}
+    others = bad | {"refused": ["ms"], "certified": False}
+    rows = [kept, bad, confirmed, refuted, refuted | {"bad": True}, others, {"status": "none"}]
     assert list(judge.summarise(rows)) == [
-        "5 cases, 4 tuned; 4 on fits that are met",
-        "refused by a log alone     2, of which fine 1",
+        "7 cases, 6 tuned; 4 on fits that are met",
+        "certified without the logs 5, bad of these 2; on fits that are met 4, bad of these 1",
+        "certified with them        3, bad of these 1; on fits that are met 2, bad of these 0",
+        "refused by a log alone     2, of which fine 1: of all 20.0 %, below 65.7 %",
+        "refused by other checks    1, bad of these 1; by a log too 0, bad of these 0",
+        "confirmed by a log         1, over Ms 0: 0.0 %, below 95.0 %",
     ]
 
 
