@@ -63,6 +63,11 @@ def test_laws_that_logs_refuse_though_they_are_fine_are_counted_with_a_bound(mon
         "refused by other checks    1, bad of these 1; by a log too 0, bad of these 0",
         "confirmed by a log         1, over Ms 0: 0.0 %, below 95.0 %",
     ]
+    unplayed = {name: kept[name] for name in ("fit_met", "certified", "refused", "logs")}
+    assert list(judge.summarise([unplayed, unplayed, refuted])) == [
+        "3 cases, 3 tuned; 3 on fits that are met",
+        "refused by a log alone     1, of which fine 1: of all 33.3 %, below 86.5 %",
+    ]
 
 
 EMPS = {"M": 95.1, "F_v": 203.5, "F_c": 20.39, "O": -3.165}

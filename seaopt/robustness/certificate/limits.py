@@ -158,6 +158,8 @@ def describe_log(log: LogVerdict) -> str:
     measured = "UNSTABLE" if np.isinf(log.ms) else f"Ms {log.ms:.3g}"
     alone = f", at its amplitude of {log.amplitude:.3g} {log.unit} rms" if log.at_amplitude else ""
     sure = "not independent" if log.confidence is None else f"at {100 * log.confidence:g} %"
+    if log.outcome == "undecided" and log.asked_hz is not None:
+        sure = f"not confirmed {sure}, which asks for all from {format_band(log.asked_hz)} Hz"
     return (
         f"{log.samples}, {log.outcome} at {log.ms_hz:.3g} Hz: measured {measured}, predicted {log.ms_predicted:.3g}; "
         f"it tells from {format_band(log.band_hz)} Hz{alone}; {sure}"

@@ -69,10 +69,11 @@ class LogVerdict:
     ms_hz: float  # that line
     ms_least: OrInfinite  # what the log leaves there at least
     ms_predicted: float  # at `ms_hz`
-    confidence: float | None  # of a refutation, or a confirmation; None of samples that were fitted
+    confidence: float | None  # of a refutation, or a confirmation, had or not; None of samples that were fitted
     amplitude: float  # rms of the input, in `unit`
     unit: str
     at_amplitude: bool  # friction is dry: at another amplitude the response is another one
+    asked_hz: tuple[float, float] | None = None  # from where to where lines must keep the limit to confirm it
 
 
 @record
@@ -291,6 +292,7 @@ def _judge(
         amplitude=float(np.nanstd(part.command[part.rows])),
         unit=controller.command.unit,
         at_amplitude=part.dry,
+        asked_hz=_ask_band(controller, surest) if independent else None,
     )
 
 
@@ -315,16 +317,22 @@ def _is_turned(model: Any, error: Any, radius: Any) -> bool:
     return bool(all(ends) and known and abs(np.sum(steps)) > np.pi)
 
 
+def _ask_band(controller: Controller, lines: _Lines) -> tuple[float, float]:
+    """Return a band about the crossover and the largest sensitivity that is predicted."""
+    middle = controller.achieved.crossover_hz or controller.spec.bandwidth_hz
+    peaks = controller.achieved.ms_hz, float(lines.f[np.argmin(lines.predicted)])  # that of the design, and at the log
+    return ABOUT[0] * middle, ABOUT[1] * float(np.nanmax([middle, *peaks]))
+
+
 def _confirm(controller: Controller, lines: _Lines, limit: float) -> tuple[float, float] | None:
-    """Return the band in which every line keeps the limit, the error of each along a radius; None where it does not lie
-    about the crossover and the largest sensitivity that is predicted.
+    """Return the band in which every line keeps the limit, the error of each along a radius; None where that lacks a
+    part of the band that is asked.
     """
     from scipy.special import stdtrit  # deferred: 0.1 s
 
     x = lines.std * stdtrit(2.0 * lines.freedom, 1.0 - CONFIRM / LENGTHS) / np.sqrt(2.0) + lines.unseen
     kept = lines.measured - x - 0.5 * limit * x**2 >= 1.0 / limit
     f = lines.f[find_band(lines.f, kept)]
-    middle = controller.achieved.crossover_hz or controller.spec.bandwidth_hz
-    highest = max(middle, float(lines.f[np.argmin(lines.predicted)]))
-    covers = lines.gapless and f.size and f[0] <= ABOUT[0] * middle and f[-1] >= ABOUT[1] * highest
+    low, high = _ask_band(controller, lines)
+    covers = lines.gapless and f.size and f[0] <= low and f[-1] >= high
     return (float(f[0]), float(f[-1])) if covers else None

@@ -15,7 +15,7 @@ from seaopt.errors import LogError
 from seaopt.files import to_json
 from seaopt.frequency.residual import find_feedback, measure_residual
 from seaopt.problem.stages import certify_problem
-from seaopt.robustness.certificate.limits import LOG_SENSITIVITY
+from seaopt.robustness.certificate.limits import LOG_SENSITIVITY, describe_log
 from seaopt.robustness.certificate.simulated import STEPS
 from seaopt.robustness.uncertainty.logs import GRACE, SilentLog, judge_log
 from tests.checks import leave_out
@@ -129,6 +129,22 @@ def test_right_model_passes_and_fitted_samples_confirm_nothing(stand, controller
     assert (held_out.experiment, held_out.samples) == ("chirp1", "held out")
     assert (other.experiment, other.samples, other.outcome) == ("other2", "validate", "confirmed")
     assert other.confidence == 0.95
+
+
+def test_log_that_is_too_narrow_confirms_nothing_and_says_what_it_would_have_to_tell(stand, thor, controller, right):
+    wide = record(thor, 0.0, 2)
+    sos = scipy.signal.butter(8, 25.0, fs=RATE, output="sos")
+    current = scipy.signal.sosfilt(sos, wide["I"])
+    force = scipy.signal.lfilter(*sampled_stand(thor, 0.0), current)
+    force += np.random.default_rng(4).normal(scale=NOISE, size=force.size)
+    narrow = so.Log.from_arrays(time=wide.time, I=current, F1=force)
+    for log, outcome in ((wide, "confirmed"), (narrow, "undecided")):
+        ((verdict,), _) = judge_log(controller, right, so.Experiment(plant=stand, log=log, name="other"), 1.9)
+        assert verdict.outcome == outcome and verdict.asked_hz is not None
+        low, high = verdict.asked_hz
+        assert low < controller.achieved.crossover_hz < controller.achieved.ms_hz < high
+        assert (verdict.band_hz[1] < high) == (outcome == "undecided")
+    assert f"; not confirmed at 95 %, which asks for all from {low:.3g} to" in describe_log(verdict)
 
 
 def test_log_for_validation_refutes_at_its_confidence(stand, controller, fit_to):

@@ -29,6 +29,8 @@ def test_the_row_of_a_log_says_how_surely_and_where_it_tells():
     assert describe_log(rubbing) == f"{said}, at its amplitude of 1.49 A rms; not independent"
     held = describe_log(replace(FITTED, samples="held out", outcome="confirmed", confidence=0.95))
     assert held.startswith("held out, confirmed at 54.5 Hz: ") and held.endswith("to 151 Hz; at 95 %")
+    narrow = describe_log(replace(FITTED, samples="held out", confidence=0.95, asked_hz=(20.0, 160.0)))
+    assert narrow.endswith("to 151 Hz; not confirmed at 95 %, which asks for all from 20 to 160 Hz")
     assert ": measured UNSTABLE, predicted" in describe_log(replace(FITTED, outcome="refuted", ms=np.inf))
 
 
