@@ -156,7 +156,7 @@ def judge_logs(survey: Survey, _: Progress) -> Evidence:
 def describe_log(log: LogVerdict) -> str:
     """Return what a log says of the loop, up to which frequency and how surely, for its row."""
     measured = "UNSTABLE" if np.isinf(log.ms) else f"Ms {log.ms:.3g}"
-    alone = f", at its amplitude of {log.amplitude:.3g} {log.unit} rms" if log.at_amplitude else ""
+    alone = f", at its amplitude of {log.amplitude:.3g} {log.unit} rms alone" if log.at_amplitude else ""
     sure = "not independent" if log.confidence is None else f"at {100 * log.confidence:g} %"
     if log.outcome == "undecided" and log.asked_hz is not None:
         sure = f"not confirmed {sure}, which asks for all from {format_band(log.asked_hz)} Hz"

@@ -26,7 +26,7 @@ def test_the_row_of_a_log_says_how_surely_and_where_it_tells():
     said = "fitted, undecided at 54.5 Hz: measured Ms 1.7, predicted 1.59; it tells from 0.8 to 151 Hz"
     assert describe_log(FITTED) == f"{said}; not independent"
     rubbing = replace(FITTED, at_amplitude=True)
-    assert describe_log(rubbing) == f"{said}, at its amplitude of 1.49 A rms; not independent"
+    assert describe_log(rubbing) == f"{said}, at its amplitude of 1.49 A rms alone; not independent"
     held = describe_log(replace(FITTED, samples="held out", outcome="confirmed", confidence=0.95))
     assert held.startswith("held out, confirmed at 54.5 Hz: ") and held.endswith("to 151 Hz; at 95 %")
     narrow = describe_log(replace(FITTED, samples="held out", confidence=0.95, asked_hz=(20.0, 160.0)))
