@@ -39,13 +39,13 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
     seen = fit.identifiability.rank == fit.identifiability.free > 0
     if not doubtful or not seen or problem.predicts:
         return
+    colour = measure_colour(fit.covariance, fit.white_covariance)
     try:
-        solved = _search(fit, minimum)
+        solved = _search(fit, minimum, 2.0 * ENOUGH * colour)
     except SeaoptError:  # what cannot be simulated is no minimum
         return
     if solved is None or not np.isfinite(solved.misfit):
         return
-    colour = measure_colour(fit.covariance, fit.white_covariance)
     gain = 0.5 * (measure_misfit(problem.evaluate(minimum.z)) - solved.misfit) / colour
     values = problem.unknowns.by_name(solved.solution.z)
     moved = _find_moved(fit, values)
@@ -76,11 +76,11 @@ def _find_moved(fit: Fit, values: Mapping[str, float], scale: float = 1.0) -> li
     return moved
 
 
-def _search(fit: Fit, minimum: Minimum) -> Solved | None:
+def _search(fit: Fit, minimum: Minimum, worse: float) -> Solved | None:
     """Return the better minimum from the given values, and from the fit's off by a factor, up and down in turn; None
-    where both come back to the fit.
+    where both come back to the fit, or to a misfit that with the same steps is by so much `worse` than there.
     """
-    coarse, _ = coarsen(minimum.problem, minimum.z)
+    coarse, there = coarsen(minimum.problem, minimum.z)
     unknowns = coarse.unknowns
     factors = np.where(np.arange(unknowns.shared) % 2, OFF, 1.0 / OFF)
 
@@ -93,6 +93,10 @@ def _search(fit: Fit, minimum: Minimum) -> Solved | None:
         start[: unknowns.shared] = values
         evaluation = coarse.evaluate(np.clip(start, unknowns.low, unknowns.high))
         found = settle_roughly(coarse, evaluation, ends=comes_back, checked=True)
+        if found.misfit > measure_misfit(there) + worse:
+            continue
         if not comes_back(found.solution.evaluation):
-            solved.append(refine_to(found, minimum.problem))
+            found = refine_to(found, minimum.problem, comes_back)
+        if not comes_back(found.solution.evaluation):
+            solved.append(found)
     return min(solved, key=lambda each: each.misfit, default=None)

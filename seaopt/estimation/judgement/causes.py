@@ -45,9 +45,8 @@ ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that
 SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the cause, and others need not be tried
 HALVED = 0.5  # of a residual's power: what leaves less is another explanation, wherever the estimates are
 MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
-# Of the samples: a misfit that is so much larger after some iterations, and a likelihood that is so much smaller at the
-# end, are no better with finer steps.
-HOPELESS, PATIENCE, ASTRAY = 1.4, 8, 0.05
+HOPELESS, PATIENCE = 1.4, 8  # a misfit that is larger by so much of the samples, after so many iterations, stays so
+PROMISES = 0.5  # of a gain that counts: what shows with coarse steps, the same in fit and refit, before finer are made
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
 
 
@@ -90,7 +89,10 @@ def find_causes(
     fitted = minimum.problem.evaluate(minimum.z)
     whole = _measure_powers(fitted, minimum.problem)
     # Steps as coarse as the residual allows, until a refit is worth finer ones.
-    coarse = minimum.problem if _is_near_noise(fit) else coarsen(minimum.problem, minimum.z)[0]
+    coarse, rough = minimum.problem, fitted
+    if not _is_near_noise(fit) and not coarse.predicts:
+        coarse, rough = coarsen(coarse, minimum.z)
+        rough = settle_roughly(coarse, rough, checked=True).solution.evaluation
     colour = measure_colour(fit.covariance, fit.white_covariance)
     causes: list[Cause] = []
     candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor, noticed=noticed))
@@ -103,16 +105,13 @@ def find_causes(
         progress(f"trying cause {number} of {len(candidates)}", max(spent, (number - 1) / len(candidates)))
         try:
             solved = _refit(minimum, candidate, coarse, measure_misfit(fitted) + HOPELESS * fit.samples)
-            before = _measure_kept(fit, minimum, candidate.kept) if candidate.kept else whole
-            if solved is not None and _measure_gain(before, solved) > -ASTRAY * fit.samples:
-                solved = refine_to(solved, minimum.problem)
+            if solved is None or not _promises(fit, candidate, coarse, rough, solved, colour):
+                continue
+            before = _measure_kept(fit, minimum.problem, minimum.z, candidate.kept) if candidate.kept else whole
+            solved = refine_to(solved, minimum.problem)
         except SeaoptError:  # what does not make a problem explains nothing
             continue
-        cause = (
-            None
-            if solved is None
-            else _weigh(fit, candidate, solved.problem, solved.solution.evaluation, before, colour, poor=poor)
-        )
+        cause = _weigh(fit, candidate, solved.problem, solved.solution.evaluation, before, colour, poor=poor)
         if cause is not None:
             causes.append(cause)
             if poor and cause.solved:
@@ -132,9 +131,19 @@ def _measure_powers(evaluation: Evaluation, problem: FitProblem) -> Float[np.nda
     return np.maximum(np.concatenate(rows), 1e-24)
 
 
-def _measure_kept(fit: Fit, minimum: Minimum, kept: Sequence[Experiment]) -> Float[np.ndarray, "outputs 2"]:
-    """Return the powers of the fit's residuals over some of its samples."""
-    problem, z = minimum.problem.rebuild(fit.parameters, minimum.z, {e.name: e for e in kept})
+def _promises(
+    fit: Fit, candidate: Candidate, coarse: FitProblem, rough: Evaluation, solved: Solved, colour: float
+) -> bool:
+    """Tell whether a refit may gain what counts over the fit with the same steps, whose minimum is `rough`."""
+    before = _measure_kept(fit, coarse, rough.z, candidate.kept) if candidate.kept else _measure_powers(rough, coarse)
+    return _measure_gain(before, solved) > PROMISES * ENOUGH * colour
+
+
+def _measure_kept(
+    fit: Fit, problem: FitProblem, z: Vector, kept: Sequence[Experiment]
+) -> Float[np.ndarray, "outputs 2"]:
+    """Return the powers of a fit's residuals at z over some of its samples."""
+    problem, z = problem.rebuild(fit.parameters, z, {e.name: e for e in kept})
     spread = {e.name: np.array([measure_spread(e.log[name]) for name in e.outputs]) for e in kept}
     problem = problem.with_values("spread", spread)
     return _measure_powers(problem.evaluate(z), problem)

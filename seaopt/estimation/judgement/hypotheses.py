@@ -27,6 +27,7 @@ from seaopt.plants.plant import name_symbols
 from seaopt.records import record
 from seaopt.simulation import simulate
 
+FASTEST = 2.0  # of the rate of a log: a pole beyond it does nothing that the log shows, and takes ever shorter steps
 LARGEST = 0.999  # quantile of a size over a log: what it has at its largest, but for rounding
 SIMULATED = 1e-2  # of a signal: error of the simulation that tells sizes
 
@@ -54,9 +55,9 @@ class Hypothesis:
     """What a model may lack: in words, the part that brings it, and from which values of its own a refit starts.
 
     Those that it frees are the first of each start; `fixed` are chosen once. What is `searched` is free in the refit
-    alone, and fixed at its value where the effect is taken: logs hardly tell how large it is. `usual` is of what logs
-    often do not show at all: a size that actuators have, with a spring of that stiffness (`silence`); `built_in` the
-    parameter by which a plant has it without the part.
+    alone, and fixed at its value where the effect is taken: logs hardly tell how large it is. `poles` are in Hz.
+    `usual` is of what logs often do not show at all: a size that actuators have, with a spring of that stiffness
+    (`silence`); `built_in` the parameter by which a plant has it without the part.
     """
 
     effect: str
@@ -64,6 +65,7 @@ class Hypothesis:
     starts: Callable[[Sizes], Starts]
     fixed: Callable[[Sizes], Mapping[str, float]] = lambda sizes: {}
     searched: tuple[str, ...] = ()
+    poles: tuple[str, ...] = ()
     usual: Callable[[float], float] | None = None
     built_in: Callable[[Plant], str | None] = lambda plant: None
     lag: Callable[[Mapping[str, float]], float] = lambda start: 0.0  # s, that a fitted delay has in place of the effect
@@ -106,6 +108,7 @@ HYPOTHESES = (
         part="current_loop",
         # From more than twice of what it is a step goes beyond zero, from half of it a search is slow.
         starts=lambda s: [{"current_loop_hz": hertz} for hertz in (60.0, 110.0, 200.0)],
+        poles=("current_loop_hz",),
         lag=lambda start: 1.0 / (2.0 * math.pi * start["current_loop_hz"]),
     ),
     Hypothesis(effect="friction changes over the log", part="friction_drift", starts=_zero("w_c", "b_t")),
@@ -221,11 +224,14 @@ def change_plants(
     declared = next(iter(changed.values())).parameters
     if not names <= declared.keys():  # such plants have it without the part, under a name of their own
         return None
-    added: list[Parameter] = []
+    added, fastest = list[Parameter](), FASTEST / min(experiment.log.period for experiment in experiments)
     for name, value in {**starts[0], **fixed}.items():
         parameter = declared[name]
         assert isinstance(parameter, Parameter)
-        added.append(replace(parameter, value=max(value, parameter.min), free=name in starts[0]))
+        if name in hypothesis.poles:
+            parameter = replace(parameter, max=min(parameter.max, fastest))
+        value = min(max(value, parameter.min), parameter.max)
+        added.append(replace(parameter, value=value, free=name in starts[0]))
     return Change(
         hypotheses=(*(before.hypotheses if before else ()), hypothesis),
         frees=(*(before.frees if before else ()), *starts[0]),

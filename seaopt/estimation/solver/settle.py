@@ -265,13 +265,18 @@ def _take_sigma(problem: FitProblem, evaluation: Evaluation) -> tuple[FitProblem
     return problem, problem.assemble(evaluation.passes, evaluation.z)
 
 
-def refine_to(solved: Solved, fine: FitProblem) -> Solved:
-    """Return a rough minimum with integration steps as fine as a problem's, so that it can be compared with its own."""
+def refine_to(solved: Solved, fine: FitProblem, ends: Callable[[Evaluation], bool] | None = None) -> Solved:
+    """Return a rough minimum with integration steps as fine as a problem's, so that it can be compared with its own.
+    `ends`: tells of each point whether it is all that is asked for.
+    """
     steps = {e.name: e.substeps for e in fine.experiments}
     problem = solved.problem.with_each(substeps=max(steps.values()))
     if all(e.substeps >= problem.experiments[0].substeps for e in solved.problem.experiments):
         return solved
     problem, evaluation = _take_sigma(problem, problem.evaluate(solved.solution.z))
+    if ends is not None and ends(evaluation):
+        found = replace(solved.solution, z=evaluation.z, evaluation=evaluation)
+        return Solved(problem=problem, solution=found, step_error=StepError())
     solution = minimise(
         bound_steps(problem, evaluation),
         evaluation,
@@ -280,6 +285,7 @@ def refine_to(solved: Solved, fine: FitProblem) -> Solved:
         decrement=NEAR,
         max_iterations=ROUGH_ITERATIONS,
         flat=measure_flatness(problem),
+        ends=ends,
     )
     return Solved(problem=problem, solution=solution, step_error=StepError())
 

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 
 import seaopt as so
+from seaopt.estimation.judgement import another_start
 
 N = 4000
 WAVE = so.Plant(
@@ -42,6 +43,14 @@ def test_the_lowest_lobe_is_not_doubted():
     fit = fit_from(1.02)
     assert abs(fit.parameters["a"].value - 1.0) < 0.01
     assert not list_starts(fit) and fit.met
+
+
+def test_a_minimum_that_is_far_worse_is_not_refined(monkeypatch):
+    """A lobe of the wave leaves 3 % of its power where the noise is 0.5 %: coarse steps tell."""
+    refined = []
+    monkeypatch.setattr(another_start, "refine_to", lambda *given: refined.append(given))
+    assert not list_starts(fit_from(1.02))
+    assert not refined
 
 
 def test_to_start_elsewhere_takes_all_values():

@@ -1,0 +1,71 @@
+"""What a judgement simulates with steps as fine as a fit's, or finer: only what it needs them for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.estimation.judgement import causes
+from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Sizes, change_plants
+from seaopt.estimation.solver.settle import refine_to
+from tests.actuator_logs import integrate
+
+RATE_HZ, SECONDS, STEPS = 250.0, 6.0, 16
+TRUTH = {"J_m": 2.4e-5, "b_r": 1e-4, "f_c": 0.012, "N": 100.0, "K_tau": 0.05, "k_s": 300.0}
+SHARP, SMOOTH = 0.2, 4.0  # rad/s
+
+
+def record():
+    """Return the log of a motor on a held spring, whose friction turns within a twentieth of what the fit takes."""
+    rng, n, p = np.random.default_rng(3), round(SECONDS * RATE_HZ), TRUTH
+    t = np.arange(n) / RATE_HZ
+    sweep = 2 * math.pi * 0.3 * SECONDS / math.log(60) * (60 ** (t / SECONDS) - 1.0)
+    current = 2.0 * np.sin(sweep) + np.sin(2 * math.pi * 0.7 * t + 1.0)
+
+    def rates(x, ampere):
+        angle, speed = x
+        rub = p["f_c"] * math.tanh(speed / SHARP) + p["b_r"] * speed
+        return speed, (p["K_tau"] * ampere - rub - p["k_s"] * angle / p["N"] ** 2) / p["J_m"]
+
+    angle, _ = integrate(rates, 2, current, 1.0 / RATE_HZ, STEPS)
+    return so.Log.from_arrays(
+        time=t, I=current, tau_s=p["k_s"] * angle / p["N"] + rng.normal(scale=0.06, size=n),
+        theta_m=angle + rng.normal(scale=1e-4, size=n),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def log():
+    return record()
+
+
+def pose(log):
+    plant = so.plants.rotary(link="locked")
+    given = {"J_m": 3.4e-5, "b_r": 2e-4, "k_s": 200.0, "f_c": 0.008}
+    params = plant.defaults.update(**TRUTH | given, v_s=SMOOTH).free(*given)
+    return so.Experiment(plant=plant, log=log, outputs=("tau_s", "theta_m")), params
+
+
+def test_only_what_gains_with_coarse_steps_is_refitted_with_fine_ones(log, monkeypatch):
+    experiment, params = pose(log)
+    refined = []
+
+    def refine(solved, fine):
+        refined.append(set(solved.problem.shared_names) - set(fine.shared_names))
+        return refine_to(solved, fine)
+
+    monkeypatch.setattr(causes, "refine_to", refine)
+    fit = so.fit([experiment], params)
+    assert any(finding.kind == "cause" and finding.where == "v_s" for finding in fit.errors), fit.findings
+    assert refined == [{"v_s"}]  # and neither delays, poles, nor what would take a value of its own
+
+
+def test_a_pole_goes_no_farther_than_a_log_shows(log):
+    experiment, params = pose(log)
+    hypothesis = next(each for each in HYPOTHESES if each.part == "current_loop")
+    sizes = Sizes(current=3.0, speed=100.0, travel=10.0, friction=0.012, deflection=0.05, stiffness=300.0)
+    change = change_plants(hypothesis, (experiment,), params, sizes)
+    assert change.params["current_loop_hz"].max == pytest.approx(2.0 * RATE_HZ)
