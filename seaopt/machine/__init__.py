@@ -4,7 +4,8 @@ from seaopt.machine.acceptance import Acceptance, accept
 from seaopt.machine.bringup import Band, BringUp, Stage, bring_up
 from seaopt.machine.bringup_files import write_bring_up
 from seaopt.machine.causes import Cause
-from seaopt.machine.differences import Difference, Differences
+from seaopt.machine.differences.certified import Differences
+from seaopt.machine.differences.explanations import Difference
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.verdicts import Judged, Response
 

@@ -20,7 +20,7 @@ from seaopt.formatting import join_words
 from seaopt.logs import Log
 from seaopt.machine.causes import Cause
 from seaopt.machine.decimated import shift_command
-from seaopt.machine.differences import Differences, compare
+from seaopt.machine.differences.certified import Differences, compare
 from seaopt.machine.replay import Replay, replay
 from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response

@@ -9,7 +9,8 @@ from pathlib import Path
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.causes import Cause, read_gains
-from seaopt.machine.differences import Difference, Differences
+from seaopt.machine.differences.certified import Differences
+from seaopt.machine.differences.explanations import Difference
 from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, Judged, Measured, Response
@@ -115,7 +116,8 @@ def say_cause(cause: Cause) -> str:
 
 def say_difference(each: Difference) -> str:
     """Return a difference in words."""
-    also = f" (or {join_words(each.alike)})" if each.alike else ""
+    others = [f"{name} {format_number(value, 3)}" for name, value in zip(each.alike, each.alike_values, strict=True)]
+    also = f" (or {', or '.join(others)})" if others else ""
     match each.kind:
         case "range":
             return (

@@ -10,7 +10,10 @@ to the commands is :math:`C A^k x_0`, which is linear in it.
 
 **What rounding allows.** The logged command is off by up to half its step. A reading that is logged coarser than the
 law saw it, by a step :math:`q`, adds an error of variance :math:`\frac{q^2}{12} \sum_{j \le k} h_j^2` at row k, with
-the law's impulse response h: it grows with the integral. Levels of a reference of steps are no rounding.
+the law's impulse response h: it grows with the integral. A reading at the edge of its sensor's range is rounded alike
+in all those rows: there it is :math:`\frac{q^2}{12} (\sum_j h_j)^2`. Levels of a reference of steps are no rounding.
+In a long log that hides much; within some seconds rounding adds up to no more than in a log of these, but for what the
+integrals hold at the first of them, a polynomial, which is taken out of them first.
 """
 
 from __future__ import annotations
@@ -38,7 +41,7 @@ from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.running.law_step import run_law
 from seaopt.errors import SeaoptError
 from seaopt.logs.quality.faults import find_quantisation
-from seaopt.machine.ticks import AT_LIMIT, Ticks
+from seaopt.machine.ticks import AT_LIMIT, Ticks, find_edges
 from seaopt.records import record
 from seaopt.robustness import linear_controller
 
@@ -51,7 +54,7 @@ HEAD = 400  # rows that tell the state at the first
 HEAD_DECAYS, LONGEST_HEAD = 3.0, 20000  # time constants of the slowest part that they last besides, and rows at most
 INTEGRATES = 1e-6  # distance from 1 of a pole that does not decay
 LEVELS = 200  # of a reference that is taken for rounded; what has fewer is steps
-LONGEST_RESPONSE = 5000  # rows over which an error of rounding is added up
+LONGEST_RESPONSE = 5000  # rows after which an impulse has left what the integrals hold of it
 Source = Controller | ScheduledController | ForceMPC
 State = LawState | MPCState
 
@@ -177,6 +180,8 @@ class Match:
     commands: Float[np.ndarray, " n"]
     allowed: Float[np.ndarray, " n"]
     error: Float[np.ndarray, " n"]
+    integrals: int  # of the law, in which rounding adds up
+    allowed_within: float  # rms, within stretches, beside what the integrals hold at the start of each
 
     @property
     def energy(self) -> float:
@@ -185,15 +190,33 @@ class Match:
 
     @property
     def met(self) -> bool:
-        """Whether nothing is left but rounding."""
-        return self.energy <= ROUNDING**2 * float(np.mean(self.allowed**2))
+        """Whether nothing is left but rounding, in all and within stretches."""
+        if self.energy > ROUNDING**2 * float(np.mean(self.allowed**2)):
+            return False
+        within = _leave_integrals(self.error, self.integrals)
+        return float(np.mean(within**2)) <= (ROUNDING * self.allowed_within) ** 2
+
+
+def _leave_integrals(error: Float[np.ndarray, " n"], integrals: int) -> Float[np.ndarray, " n"]:
+    """Return an error without what integrals make of it between stretches: in each, the polynomial of so many terms
+    that is nearest to it.
+    """
+    left = list[Any]()
+    for part in np.array_split(error, max(1, error.size // LONGEST_RESPONSE)):
+        powers = np.vander(np.linspace(-1.0, 1.0, part.size), integrals)
+        left.append(part - powers @ np.linalg.lstsq(powers, part, rcond=None)[0])
+    return np.concatenate(left)
+
+
+def _count_integrals(law: RunnableLaw) -> int:
+    return int(np.count_nonzero(np.abs(np.linalg.eigvals(law.a) - 1.0) < INTEGRATES)) if law.c.size else 0
 
 
 def play(setting: Setting) -> Match:
     """Return the commands of a setting's law on its log."""
     ticks, linear = setting.ticks, setting.linear
     head = ticks.take(slice(0, count_head(linear)))
-    allowed = _allow(linear, ticks)
+    allowed, allowed_within = _allow(linear, ticks)
     allowed_head, floor = allowed[: len(head)], FLOOR * float(np.std(ticks.command))
     # A start that is nearly right drifts in the integrals: what the floor allows is not taken for rounding.
     exact = float(np.mean(allowed_head**2)) - (1.0 - EXACT**2) * floor**2
@@ -217,7 +240,13 @@ def play(setting: Setting) -> Match:
     commands = np.concatenate([ticks.command[:first], run_setting(setting, ticks.take(slice(first, None)), start)])
     if linear.compensation is not None:  # which differences to a row before the first
         commands[0] = ticks.command[0]
-    return Match(commands=commands, allowed=allowed, error=commands - ticks.command)
+    return Match(
+        commands=commands,
+        allowed=allowed,
+        error=commands - ticks.command,
+        integrals=_count_integrals(linear),
+        allowed_within=allowed_within,
+    )
 
 
 def count_head(law: RunnableLaw) -> int:
@@ -290,9 +319,11 @@ def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, "
     return np.linalg.lstsq(modes, left[~limited] * weight, rcond=1e-10)[0]
 
 
-def _allow(law: RunnableLaw, ticks: Ticks) -> Float[np.ndarray, " n"]:
-    """Return one std of what rounding allows at each row."""
-    n = len(ticks)
+def _allow(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], float]:
+    """Return one std of what rounding allows at each row, and its rms within stretches."""
+    from scipy.signal import fftconvolve  # deferred: 0.3 s
+
+    n, integrals = len(ticks), _count_integrals(law)
     response = find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
     steps: list[Any] = []
     if np.unique(ticks.reference).size >= LEVELS:
@@ -300,10 +331,16 @@ def _allow(law: RunnableLaw, ticks: Ticks) -> Float[np.ndarray, " n"]:
     columns = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
     steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i]) for i in range(law.measured)]
     variance = np.full(n, ticks.quantum**2 / 12.0 + (FLOOR * float(np.std(ticks.command))) ** 2)
+    within = float(variance[0])
     for b, d, values in steps:
-        quantum = find_quantisation(values)
-        if quantum:
+        each = find_quantisation(values) ** 2 / 12.0
+        if each:
             impulse = np.concatenate([[law.per_effort * d], response @ b])
-            grown = np.cumsum(impulse**2) * quantum**2 / 12.0
-            variance += grown[np.minimum(np.arange(n), grown.size - 1)]
-    return np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+            within += each * float(np.mean(np.cumsum(impulse**2)))
+            impulse = np.pad(impulse, (0, n - impulse.size), mode="edge")
+            variance += each * np.cumsum(impulse**2)
+            for edge in find_edges(values):
+                walk = fftconvolve(edge.astype(float), impulse)[:n]
+                variance += each * walk**2
+                within += each * float(np.mean(_leave_integrals(walk, integrals) ** 2))
+    return np.sqrt(np.maximum(variance, np.finfo(float).tiny)), math.sqrt(within)

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from seaopt.control import Controller
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import LogError
 from seaopt.formatting import join_words
 from seaopt.logs import Log
-from seaopt.logs.quality.faults import find_quantisation
+from seaopt.logs.quality.faults import find_quantisation, find_rails, measure_stillness
 from seaopt.records import record
 from seaopt.signals import REFERENCES
 
 AT_LIMIT = 1.0 - 1e-6  # of the command's limit, from which on it is there
 FORGETS = 35.0  # time constants in which nothing is left of a start
+FEWEST_FLAT, FEWEST_VISITS, FLAT = 10, 3, 3  # readings at the edge of a range, visits of it, and rows of one
 FEWEST = 50  # ticks that a replay takes at least
 
 
@@ -35,6 +37,7 @@ class Ticks:
     command: Float[np.ndarray, " n"]
     place: Float[np.ndarray, " n"] | None = None  # of a schedule, its variable
     rendered: dict[str, Float[np.ndarray, " n"]] | None = None  # parts of an outer loop, of which reference is the sum
+    beside: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict[str, Any])  # outputs it does not read
     left_out: int = 0  # rows of the log that are in no such stretch
 
     def __len__(self) -> int:
@@ -51,6 +54,7 @@ class Ticks:
             place=None if self.place is None else self.place[read],
             rendered=self.rendered and {name: part[rows] for name, part in self.rendered.items()},
             command=self.command[rows if command is None else command],
+            beside={name: part[read] for name, part in self.beside.items()},
         )
 
     def move_command(self, late: int) -> Ticks:
@@ -139,9 +143,17 @@ def take_ticks(
         measured=table[:, 2 : 2 + count],
         further=table[:, 2 + count : further],
         place=place,
+        beside=_take_beside(controller, log, rows),
         left_out=len(log) - len(table),
     )
     return ticks if around is None else _render(ticks, around, table[:, 2 + names.index(around.position)])
+
+
+def _take_beside(controller: Controller, log: Log, rows: slice) -> dict[str, Float[np.ndarray, " n"]]:
+    """Return the outputs of the design plant that were logged without a gap, and that the law does not feed back."""
+    outputs = {} if controller.design is None else controller.see(controller.design[0]).outputs
+    found = {name: log[name][rows] for name in outputs if name in log.signals and name not in controller.signals}
+    return {name: column for name, column in found.items() if np.all(np.isfinite(column))}
 
 
 def _render(ticks: Ticks, outer: OuterLoop, position: Float[np.ndarray, " n"]) -> Ticks:
@@ -163,6 +175,20 @@ def _find_longest(log: Log, whole: Any) -> slice:
             if stop - start > best.stop - best.start:
                 best = slice(segment.start + int(start), segment.start + int(stop))
     return best
+
+
+def find_edges(values: Float[np.ndarray, " n"]) -> list[Bool[np.ndarray, " n"]]:
+    """Return where readings are at the edge of their sensor's range: many equal ones at the largest or the least, in
+    rows one after another, where a signal that turns there by itself has few.
+    """
+    found: list[Bool[np.ndarray, " n"]] = []
+    for rail in find_rails(values, find_quantisation(values), measure_stillness(values)):
+        if rail.runs.samples >= FEWEST_FLAT and len(rail.runs) >= FEWEST_VISITS and np.max(rail.runs.lengths) >= FLAT:
+            at = np.zeros(values.size, dtype=bool)
+            for start, stop in zip(rail.runs.start, rail.runs.stop, strict=True):
+                at[start:stop] = True
+            found.append(at)
+    return found
 
 
 def find_saturated(ticks: Ticks, limit: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -37,7 +38,7 @@ class Measured:
     f: Float[np.ndarray, " m"]
     loop: Ratio  # L
     tracking: Ratio  # Y/R of the regulated output
-    plants: tuple[Ratio, ...]  # of each signal, per effort
+    outputs: Mapping[str, Ratio]  # per effort: of each signal, and of the plant's outputs that were logged besides
     periods: int
     blocks: int
     phases: int

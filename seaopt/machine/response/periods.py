@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +30,7 @@ class Blocks:
     reference: Complex[np.ndarray, "b m"]
     effort: Complex[np.ndarray, "b m"]  # the command over what an effort of one takes
     measured: Complex[np.ndarray, "b y m"]
+    beside: Mapping[str, Complex[np.ndarray, "b m"]]  # outputs that the law does not read
     realisation: Int[np.ndarray, " b"]  # which stretch of the reference, of one set of phases
     rows: int  # of a period
     period_s: float
@@ -49,7 +50,8 @@ class Blocks:
             np.array([part[chosen].mean(axis=0) for chosen in rows])
             for part in (self.reference, self.effort, self.measured)
         )
-        return replace(self, reference=reference, effort=effort, measured=measured, realisation=kinds)
+        beside = {name: np.array([part[chosen].mean(axis=0) for chosen in rows]) for name, part in self.beside.items()}
+        return replace(self, reference=reference, effort=effort, measured=measured, beside=beside, realisation=kinds)
 
 
 def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
@@ -140,6 +142,7 @@ def _transform(
         reference=scale * reference[:, lines],
         effort=scale * command[:, lines] / controller.command.per_effort,
         measured=scale * measured[:, :, lines],
+        beside={name: scale * np.fft.rfft(part[rows], axis=1)[:, lines] for name, part in ticks.beside.items()},
         realisation=np.array([number for _, number in starts]),
         rows=period,
         period_s=period / ticks.rate_hz,
@@ -166,12 +169,14 @@ def join_blocks(parts: Sequence[Blocks]) -> list[Blocks]:
 def _join(group: Sequence[Blocks]) -> Blocks:
     if len(group) == 1:
         return group[0]
+    names = set.intersection(*(set(part.beside) for part in group))
     offsets = np.cumsum([0, *(int(np.max(part.realisation)) + 1 for part in group[:-1])])
     return replace(
         group[0],
         reference=np.concatenate([part.reference for part in group]),
         effort=np.concatenate([part.effort for part in group]),
         measured=np.concatenate([part.measured for part in group]),
+        beside={name: np.concatenate([part.beside[name] for part in group]) for name in sorted(names)},
         realisation=np.concatenate([part.realisation + at for part, at in zip(group, offsets, strict=True)]),
         amplitude=float(np.mean([part.amplitude for part in group])),
         saturated=sum(part.saturated for part in group),

@@ -100,11 +100,13 @@ def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured
     effort = rows.effort / rows.reference
     measured = rows.measured / rows.reference[:, None, :]
     returned = np.sum(feedback * measured, axis=1)
+    outputs = dict(zip(controller.signals, measured.swapaxes(0, 1), strict=True))
+    outputs |= {name: each / rows.reference for name, each in rows.beside.items()}
     return Measured(
         f=blocks.f,
         loop=Ratio(numerator=returned, denominator=effort),
         tracking=Ratio(numerator=measured[:, 0], denominator=np.ones_like(effort)),
-        plants=tuple(Ratio(numerator=measured[:, i], denominator=effort) for i in range(measured.shape[1])),
+        outputs={name: Ratio(numerator=each, denominator=effort) for name, each in outputs.items()},
         periods=len(blocks.reference),
         blocks=len(rows.reference),
         phases=blocks.realisations,
@@ -178,7 +180,7 @@ def _is_same_gain(measured: Sequence[Measured]) -> bool:
     """Tell whether two amplitudes have the same gain at every line."""
     if len(measured) < 2 or any(part.f.size != measured[0].f.size for part in measured):
         return False
-    gains = [np.abs(part.plants[0].value) for part in measured]
+    gains = [np.abs(next(iter(part.outputs.values())).value) for part in measured]
     return all(bool(np.all(np.abs(gain / gains[0] - 1.0) < SAME_GAIN)) for gain in gains[1:])
 
 

@@ -1,0 +1,109 @@
+"""Whether the machine is one of those that were certified, and if not, what differs.
+
+**Inside what was certified** is a machine whose response at every line is no further from the nominal one than a draw
+of the certificate is, but for the disc of the measurement and 2 % of the response. The nearest draw is the one of the
+least misfit, sum over the lines of the square of what it is off by, over the measurement's std.
+
+A sensor is at its range where readings pile up at an edge of what was read while the command moves on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from seaopt.control import Controller
+from seaopt.machine.differences.comparison import Comparison
+from seaopt.machine.differences.explanations import Difference, explain
+from seaopt.machine.differences.leeway import take_spread
+from seaopt.machine.response.periods import shorten
+from seaopt.machine.response.verdicts import Measured, has_dry_friction
+from seaopt.machine.ticks import Ticks, find_edges
+from seaopt.records import record
+from seaopt.robustness.uncertainty.worst import place_values
+
+SIMULATED = 60  # draws that are simulated, with dry friction
+TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
+MOVES = 0.5  # of the rows in which a reading stays at an edge: the command is another than in the one before
+Values = Mapping[str, float]
+
+
+@record
+class Differences:
+    """How the measured plant differs from the certified one."""
+
+    inside: bool  # the machine is one of those that were certified
+    misfit: float  # mean square of the difference over its std; 1 is noise
+    off: float  # largest share of the response by which it differs, beyond its disc
+    off_hz: float | None
+    found: tuple[Difference, ...]
+    nearest: Mapping[str, float]  # of the certificate's draws, the values of the one that is nearest
+    nearest_misfit: float | None
+
+
+def compare(
+    controller: Controller,
+    measured: Sequence[Measured],
+    logs: Sequence[Ticks],
+    draws: Sequence[Values],
+    confidence: float,
+) -> Differences | None:
+    """Return how the machine differs from a controller's design plant; None where the controller does not know it.
+    `logs`: those that `measured` comes from. `draws`: of the certificate.
+    """
+    if controller.design is None:
+        return None
+    dry = has_dry_friction(controller)
+    logs_taken = [*map(shorten, logs)] if dry else logs
+    comparison = Comparison(controller=controller, measured=measured, logs=logs_taken, names=controller.signals)
+    beside = Comparison(
+        controller=controller, measured=measured, logs=logs_taken, names=_list_beside(measured, controller.signals)
+    )
+    plant, values = controller.design
+    nominal = plant.complete(values)
+    response, count = comparison.response, comparison.f.size
+    draws = draws[:SIMULATED] if dry else draws
+    drawn = comparison.predict([values, *(place_values(plant, values, draw) for draw in draws)])
+    model, drawn = drawn[0], np.array(drawn[1:]).reshape(-1, count)
+    before = comparison.misfit(model)
+    reach = np.max(np.abs(drawn - model), axis=0, initial=0.0)
+    left = np.abs(response - model) - comparison.radius(1.0 - confidence) - reach
+    share = left / np.abs(model)
+    flat = [*_list_clipped(controller, logs)]
+    at = {name: each.value for name, each in nominal.items()}
+    found = [*flat, *explain(comparison, beside, model, take_spread(draws, at))]
+    misfits = [comparison.misfit(row) for row in drawn]
+    best = int(np.argmin(misfits)) if misfits else None
+    inside = bool(np.all(share <= TOLERATED)) and not flat
+    worst = int(np.argmax(share))
+    return Differences(
+        inside=inside,
+        misfit=before / count,
+        off=max(float(share[worst]), 0.0),
+        off_hz=float(comparison.f[worst]) if share[worst] > TOLERATED else None,
+        found=tuple(found),
+        nearest={} if best is None else dict(draws[best]),
+        nearest_misfit=None if best is None else misfits[best] / count,
+    )
+
+
+def _list_beside(measured: Sequence[Measured], signals: Sequence[str]) -> tuple[str, ...]:
+    """Return the outputs that were logged at every amplitude, and that the law does not feed back."""
+    return tuple(
+        name for name in measured[0].outputs if name not in signals and all(name in part.outputs for part in measured)
+    )
+
+
+def _list_clipped(controller: Controller, logs: Sequence[Ticks]) -> Iterator[Difference]:
+    """Yield the signals whose readings stay at an edge while the command moves on."""
+    for i, name in enumerate(controller.signals):
+        edges = [
+            float(np.max(np.abs(ticks.measured[edge, i])))
+            for ticks in logs
+            for edge in find_edges(ticks.measured[:, i])
+            if np.mean(np.diff(ticks.command)[edge[1:] & edge[:-1]] != 0.0) > MOVES
+        ]
+        if edges:
+            unit = controller.command.reference_unit if i == 0 else ""
+            yield Difference(kind="range", name=name, value=max(edges), low=None, high=None, unit=unit, explains=1.0)

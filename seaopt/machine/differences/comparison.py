@@ -1,0 +1,107 @@
+"""The measured plant and a model of it, as one vector of lines.
+
+With dry friction the model's response is that of the same law on the nonlinear plant, simulated under the logged
+reference and cut as the log is, since it depends on amplitude; two periods of each set of phases do, without noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control import Controller, sample
+from seaopt.machine.design_run import RTOL, run_design
+from seaopt.machine.response.discs import Ratio
+from seaopt.machine.response.judged import Measured
+from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
+from seaopt.machine.response.verdicts import has_dry_friction
+from seaopt.machine.ticks import Ticks
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
+from seaopt.records import record
+
+Lines = Complex[np.ndarray, " m"]
+
+
+@record(eq=False)
+class Comparison:
+    """The measured responses of some outputs to the effort, and a model of them, as one vector of lines."""
+
+    controller: Controller
+    measured: Sequence[Measured]
+    logs: Sequence[Ticks]
+    names: tuple[str, ...]  # of the outputs
+
+    @property
+    def plant(self) -> Plant:
+        """The controller's design plant."""
+        assert self.controller.design is not None
+        return self.controller.design[0]
+
+    @property
+    def ratios(self) -> list[Ratio]:
+        """The measured responses, signal by signal, amplitude by amplitude."""
+        return [part.outputs[name] for part in self.measured for name in self.names]
+
+    @property
+    def response(self) -> Lines:
+        """The measured response."""
+        return np.concatenate([ratio.value for ratio in self.ratios])
+
+    @property
+    def std(self) -> Float[np.ndarray, " m"]:
+        """Its std, or the accuracy of the model where the periods of a log are more alike than that."""
+        return np.concatenate([np.maximum(ratio.std, RTOL * np.abs(ratio.value)) for ratio in self.ratios])
+
+    @property
+    def f(self) -> Float[np.ndarray, " m"]:
+        """Hz, of each of its lines."""
+        return np.concatenate([part.f for part in self.measured for _ in self.names])
+
+    def radius(self, alpha: float) -> Float[np.ndarray, " m"]:
+        """Return the radii of its discs, all of which hold the truth but with the probability `alpha`."""
+        each = alpha / self.f.size
+        return np.concatenate([ratio.disc(each)[1] for ratio in self.ratios])
+
+    def misfit(self, model: Lines) -> float:
+        """Return the sum of squares of a model's difference, over the std."""
+        return float(np.sum(np.abs((self.response - model) / self.std) ** 2))
+
+    def predict(self, sets: Sequence[ParameterSet]) -> list[Lines]:
+        """Return the responses of the model with each of some values."""
+        if has_dry_friction(self.controller) and sets:
+            return self._simulate(sets)
+        return [self._linearise(values) for values in sets]
+
+    def _linearise(self, values: ParameterSet) -> Lines:
+        law, seen = self.controller, self.controller.see(take_sliding(self.plant, values))
+        timing = law.sample_time_s, law.compute_delay_samples
+        sampled = sample(seen, law.delay(values), self.names, law.per_effort, *timing)
+        return np.concatenate([sampled.responses(part.f).ravel() for part in self.measured])
+
+    def _simulate(self, sets: Sequence[ParameterSet]) -> list[Lines]:
+        """Return the responses of the law on the nonlinear plant, under the logged references."""
+        runs = [run_design(self.controller, sets, ticks.reference) for ticks in self.logs]
+        return [self._cut([run.outputs for run in runs], k) for k in range(len(sets))]
+
+    def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> Lines:
+        """Return the response of the k-th of some runs, cut as the logs are."""
+        law, signals = self.controller.law, self.controller.signals
+        blocks, parts = list[Blocks](), list[Lines]()
+        for ticks, run in zip(self.logs, outputs, strict=True):
+            readings = np.column_stack([run[name][k] for name in signals])
+            beside = {name: run[name][k] for name in self.names if name not in signals}
+            simulated = replace(ticks, measured=readings, beside=beside, command=0.0 * ticks.command)
+            blocks.append(cut_periods(self.controller, simulated))
+        for group in join_blocks(blocks):
+            mean = group.average()
+            shown = dict(zip(signals, mean.measured.swapaxes(0, 1), strict=True)) | dict(mean.beside)
+            read = {name: np.mean(each / mean.reference, axis=0) for name, each in shown.items()}
+            forward, *feedback = law.responses(group.f)
+            effort = forward + np.sum(np.array(feedback) * [read[name] for name in signals], axis=0)
+            parts += [read[name] / effort for name in self.names]
+        return np.concatenate(parts)
