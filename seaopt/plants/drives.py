@@ -23,8 +23,12 @@ Parts around any plant:
     Adds :math:`g_s k_i \int (\mathrm{goal} - \theta)`; at the limit of c it stands still.
 ``servo_limit``
     c stays within +-c_max.
+``servo_hold``
+    The firmware reads its position every T_h and holds c in between, so that c is of what it read T_h/2 ago on average;
+    the goal is late by the log's delay alone. To first order that is
+    :math:`c = g_s (k_p (\mathrm{goal} - \theta + T_h \dot\theta / 2) - k_d \dot\theta)`: damping is taken away.
 ``servo_delay``
-    c acts T_v late. A servo that runs at a rate f and takes T to compute acts as late as a delay of
+    c acts T_v late, the goal in it too. A servo that runs at a rate f and takes T to compute acts as late as a delay of
     :math:`T + 1/(2 f)`.
 
 With one of the first two the current I (A) is among the outputs.
@@ -57,9 +61,10 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
         declare("g_s", 1.0, "-", 0.0, "command of one unit of gain and error"),
     ),
     "servo_integral": (declare("k_i", 0.0, "1/s", 0.0, "integral gain of the servo"),),
+    "servo_hold": (declare("T_h", 0.0, "s", 0.0, "sample time of the servo's firmware"),),
     "servo_limit": (declare("c_max", 1.0, "-", 0.0, "limit of the servo's command"),),
 }
-SERVO = ("position_servo", "servo_integral", "servo_limit")
+SERVO = ("position_servo", "servo_integral", "servo_hold", "servo_limit")
 STATED = ("k_p",)  # without a default: who has a servo knows its gain, and any other one would be a guess
 INPUTS = {"voltage_input": ("V", "V"), "duty_input": ("duty", "-")}
 SUPPLY = "supply"  # the input that is the voltage on which a duty is
@@ -139,7 +144,9 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
 
 
 def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
-    """Return a plant commanded by the goal of a position that firmware holds. Raises PlantError: no position."""
+    """Return a plant commanded by the goal of a position that firmware holds. Raises PlantError: no position, or no
+    speed beside it where readings are held.
+    """
     sensing = plant.sensing
     position = sensing and (sensing.motor_position or sensing.link_position)
     if not sensing or not position:
@@ -148,6 +155,11 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
             "sensing = Sensing(regulated, motor_position=...)"
         )
     rate = sensing.motor_speed if sensing.motor_position else (plant.port.rate if plant.port else None)
+    if "servo_hold" in parts and not rate:
+        raise PlantError(
+            f'plant {plant.name}: part "servo_hold" needs the speed of the position that is held; give the role '
+            "sensing = Sensing(regulated, motor_position=..., motor_speed=...)"
+        )
     source = next(iter(plant.inputs))
     integral, limited = "servo_integral" in parts, "servo_limit" in parts
     commanded = {} if source in plant.outputs else {source: plant.inputs[source]}  # a log may hold it, too
@@ -155,6 +167,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     def solve(t: Any, x: Any, u: Any, p: Any) -> _Solved:
         reading = getattr(x, position, None)
         error = u.goal - (plant.h(t, x, with_values(u, {source: 0.0}), p)[position] if reading is None else reading)
+        error += 0.5 * p.T_h * getattr(x, rate) if "servo_hold" in parts and rate else 0.0
         command = p.g_s * (p.k_p * error - (p.k_d * getattr(x, rate) if rate else 0.0))
         command += p.g_s * p.k_i * x.error_sum if integral else 0.0
         limited_command = ca.fmin(ca.fmax(command, -p.c_max), p.c_max) if limited else command

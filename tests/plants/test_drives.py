@@ -149,6 +149,26 @@ def test_a_servo_with_everything_is_that_of_its_equations():
     assert np.max(np.abs(run["theta_m"] - expected[:, 0])) < 2e-4 * np.max(np.abs(expected[:, 0]))
 
 
+def test_firmware_that_holds_what_it_reads_is_late_by_half_of_that():
+    """To first order: its command is of a position that goes on by half a sample time's worth of speed."""
+    plant = so.plants.rotary(parts=["duty_input", "position_servo", "servo_hold", "servo_limit"])
+    gains = {"k_p": 40.0, "k_d": 0.3, "g_s": 0.01, "c_max": 0.5, "T_h": 2e-3}
+    n = 300
+    goal = 3.0 * np.sin(np.arange(n) / 25.0)
+
+    def rates(t, x, k):
+        wanted = gains["g_s"] * (gains["k_p"] * (goal[k] - x[0] + 1e-3 * x[1]) - gains["k_d"] * x[1])
+        current = (MOTOR["V_s"] * min(max(wanted, -0.5), 0.5) - MOTOR["K_tau"] * x[1]) / MOTOR["R"]
+        return motion(t, x, current, MOTOR)
+
+    expected = integrate(rates, 4, n)
+    log = so.Log.from_arrays(time=np.arange(n) / RATE_HZ, goal=goal)
+    run = so.simulate(plant, values_of(plant, **gains), log, rtol=1e-5)
+    assert np.max(np.abs(run["theta_m"] - expected[:, 0])) < 2e-4 * np.max(np.abs(expected[:, 0]))
+    with pytest.raises(PlantError, match='"servo_hold" needs position_servo'):
+        so.plants.rotary(parts=["duty_input", "servo_hold"])
+
+
 def test_fit_of_a_log_that_holds_goal_and_position_alone():
     """The servo's gain known, an encoder on the motor tells spring, link and damping behind a firmware loop."""
     plant = so.plants.rotary(parts=["duty_input", "position_servo"])

@@ -153,6 +153,11 @@ HYPOTHESES = (
     Hypothesis(effect="the motor cogs", part="cogging", starts=lambda s: [s.ripple] if s.ripple else []),
     Hypothesis(effect="the supply sags", part="supply_sag", starts=_zero("R_b")),
     Hypothesis(
+        effect="the servo's firmware holds what it reads",
+        part="servo_hold",
+        starts=lambda s: [{"T_h": 1e-3}],
+    ),
+    Hypothesis(
         effect="the servo's firmware acts late",
         part="servo_delay",
         starts=lambda s: [{"T_v": 1e-3}],

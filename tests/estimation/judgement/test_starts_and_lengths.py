@@ -43,13 +43,13 @@ def turn_servo(goal, steps=10):
     return out
 
 
-def fit_servo(start, duration_s):
+def fit_servo(start, duration_s, *, parts=(), late_s=1.0 / RATE_HZ, **known):
     t = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
     goal = 0.15 * np.sin(2 * np.pi * (0.3 * t + 0.5 * 9.7 / 8.0 * t**2))
     log = so.Log.from_arrays(time=t, goal=goal, theta_m=turn_servo(goal))
-    plant = so.plants.let_stick(so.plants.rotary(parts=["duty_input", "position_servo"]))
-    params = plant.defaults.with_parameters(so.Parameter(name="k_p", value=GAIN, unit="-")).update(**KNOWN)
-    delay = so.Parameter(name="delay", value=1.0 / RATE_HZ, unit="s", free=True, max=0.05)
+    plant = so.plants.let_stick(so.plants.rotary(parts=["duty_input", "position_servo", *parts]))
+    params = plant.defaults.with_parameters(so.Parameter(name="k_p", value=GAIN, unit="-")).update(**KNOWN, **known)
+    delay = so.Parameter(name="delay", value=late_s, unit="s", free=True, max=0.05)
     bench = so.Experiment(plant=plant, log=log, outputs=("theta_m",), delay_s=delay, initial_state="rest")
     return so.fit([bench], params.update(**start).free(*SERVO))
 
@@ -113,3 +113,23 @@ def test_a_servo_of_coarse_steps_is_never_met_with_wrong_values():
     check(fits, SERVO)
     for fit in fits:
         assert not fit.met or fit.derived["antiresonance_hz"].value == pytest.approx(11.94, rel=0.03)
+
+
+def test_the_hold_of_a_servo_s_firmware_is_named_with_its_sample_time():
+    """What it holds takes damping away: without it the logs want a viscous friction below none, and a soft spring."""
+    fit = fit_servo(SERVO, 8.0, late_s=0.0)
+    best = fit.hypotheses[0]
+    assert not fit.met and abs(fit.parameters["k_s"].value / SERVO["k_s"] - 1.0) > 0.2
+    assert (best.parts, best.outcome) == (("servo_hold",), "adopted")
+    assert best.frees["T_h"] == pytest.approx(HOLD_S, rel=0.3)
+    assert best.parameters["k_s"] == pytest.approx(SERVO["k_s"], rel=0.1)
+
+
+def test_a_servo_whose_hold_is_given_has_its_elasticity():
+    """Its ticks are an error that is uniform within one: what is left is as large as that."""
+    fit = fit_servo(SERVO, 8.0, parts=["servo_hold"], late_s=0.0, T_h=HOLD_S)
+    for name, value in SERVO.items():
+        assert abs(fit.parameters[name].value - value) < 3.0 * fit.parameters[name].total_std, name
+    assert fit.derived["antiresonance_hz"].value == pytest.approx(11.94, rel=0.01)
+    assert fit.outputs["experiment"]["theta_m"].rms_residual == pytest.approx(TICK / np.sqrt(12.0), rel=0.05)
+    assert {finding.where for finding in fit.errors} == {"b_r"}  # known to 40 %
