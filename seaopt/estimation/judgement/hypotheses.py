@@ -233,10 +233,9 @@ def change_plants(
     for name, value in {**starts[0], **fixed}.items():
         parameter = declared[name]
         assert isinstance(parameter, Parameter)
-        if name in hypothesis.poles:
-            parameter = replace(parameter, max=min(parameter.max, fastest))
-        value = min(max(value, parameter.min), parameter.max)
-        added.append(replace(parameter, value=value, free=name in starts[0]))
+        most = fastest if name in hypothesis.poles else parameter.max
+        value = min(max(value, parameter.min), most)
+        added.append(replace(parameter, value=value, max=most, free=name in starts[0]))
     return Change(
         hypotheses=(*(before.hypotheses if before else ()), hypothesis),
         frees=(*(before.frees if before else ()), *starts[0]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,3 +70,10 @@ def test_a_pole_goes_no_farther_than_a_log_shows(log):
     sizes = Sizes(current=3.0, speed=100.0, travel=10.0, friction=0.012, deflection=0.05, stiffness=300.0)
     change = change_plants(hypothesis, (experiment,), params, sizes)
     assert change.params["current_loop_hz"].max == pytest.approx(2.0 * RATE_HZ)
+    slow = replace(
+        experiment, log=so.Log.from_arrays(time=np.arange(len(log)), **{name: log[name] for name in log.signals})
+    )
+    change = change_plants(
+        hypothesis, (slow,), params, sizes
+    )  # of one sample a second: 60 Hz is not to be started from
+    assert change.params["current_loop_hz"].value == change.params["current_loop_hz"].max == pytest.approx(2.0)
