@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
-from seaopt.estimation.judgement.ripple_search import find_ripple, move_zero
-from seaopt.estimation.problem.experiment import Experiment, is_fine
+from seaopt.estimation.judgement.ripple_search import find_followed_ripple, find_ripple, move_zero
+from seaopt.estimation.problem.experiment import Experiment, find_finest
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.formatting import join_words
@@ -278,10 +278,13 @@ def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment)
         minimum = fit.require_minimum("_measure")
         posed = next(e for e in minimum.problem.experiments if e.name == experiment.name)
         read = position in log.signals
-        place = experiment.read(position)[longest] if read else run[position]
-        ripple = find_ripple(posed, left, fit.parameters, place, number)
-        if ripple and read and not (plant.moves and is_fine(experiment.log, position, ripple["n_g"])):
-            ripple = move_zero(posed, minimum.z, ripple, position)
+        if plant.moves and read:
+            ripple = find_followed_ripple(posed, fit.parameters, longest, minimum.z)
+        if not ripple:
+            place = experiment.read(position)[longest] if read else run[position]
+            ripple = find_ripple(posed, left, fit.parameters, place, number)
+            if not (plant.moves and ripple and ripple["n_g"] <= find_finest(experiment.log, position)):
+                ripple = move_zero(posed, minimum.z, ripple, position)
     dry = 0.0 if friction is None or friction.jump is None else friction.jump(0.0, friction.add_rated(values))
     return Sizes(
         current=_find_largest(current),

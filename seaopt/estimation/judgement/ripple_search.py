@@ -8,6 +8,9 @@ passes a quarter of a period in a sample the force comes and goes faster than th
 that accounts for most of the power of some output is where the refit starts; from others it would not get there, as
 minima lie one beside the other. Which n are worth a regression is looked up first: what residuals have of a force is
 summed up place by place of the motor, and the spectrum of that has all n at once.
+
+Where a link moves, what the simulated friction does at another time than the true one is far more than cogging: there
+the force is what the measured motion lacks (`missing_force`).
 """
 
 from __future__ import annotations
@@ -17,7 +20,9 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.estimation.judgement.missing_force import find_missing_force
 from seaopt.estimation.problem.correlation import load_fft
+from seaopt.estimation.problem.experiment import find_finest
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.estimation.problem.shapes import Vector
@@ -33,6 +38,7 @@ FINE = 8  # steps on either side of the best
 NEARBY = 31  # lines of a spectrum over which its power is its own
 LEAST, OF_CHANCE = 0.01, 40.0  # of a whitened residual that a ripple has to account for, and times a sample's share
 TURNS = 0.25  # of a period, the most that the motor moves in a sample
+SURE = 1.0 / 3.0  # of the wave number that a reading is fine enough for: its steps repeat with the position, too
 SLOW = 0.2  # of the samples that have to be as slow as that
 
 Spectra = Complex[np.ndarray, "ny f"]
@@ -84,6 +90,36 @@ def find_ripple(
     best = max(best + step * np.linspace(-1.0, 1.0, 2 * FINE + 1), key=lambda wave: weigh(wave)[0])
     share, a, b = weigh(best)
     return {"a_g": a, "b_g": b, "n_g": float(best)} if share > max(LEAST, OF_CHANCE / position.size) else {}
+
+
+def find_followed_ripple(
+    experiment: FitExperiment, params: ParameterSet, rows: slice, z: Vector
+) -> Mapping[str, float]:
+    """Return amplitudes and wave number of the cogging in the force that a measured motion lacks, over some rows of a
+    log; empty where there is none.
+    """
+    missing = find_missing_force(experiment, params, rows, z)
+    if missing is None:
+        return {}
+    position, force = missing.position, missing.force
+    step, moved = np.pi / float(np.ptp(position)), np.abs(missing.speed) * experiment.period
+    top = 2.0 * np.pi * TURNS / max(float(np.quantile(moved, SLOW)), 1e-300)
+    top = min(top, MOST * step, SURE * find_finest(experiment.data.log, missing.state))
+
+    def weigh(wave: float) -> tuple[float, int, float, float]:
+        """Return the share of the force that a wave number accounts for, of how many samples, and both amplitudes."""
+        slow = moved * wave < 2.0 * np.pi * TURNS
+        waves = np.column_stack([np.sin(wave * position[slow]), np.cos(wave * position[slow])])
+        a, b = np.linalg.lstsq(waves, force[slow], rcond=1e-9)[0]
+        rest = force[slow] - waves @ (a, b)
+        return 1.0 - float(np.sum(rest**2) / np.sum(force[slow] ** 2)), int(np.sum(slow)), float(a), float(b)
+
+    best = max(_list_waves(position, force, moved, step, top), key=lambda wave: weigh(wave)[0], default=0.0)
+    if not best:
+        return {}
+    best = max(best + step * np.linspace(-1.0, 1.0, 2 * FINE + 1), key=lambda wave: weigh(wave)[0])
+    share, count, a, b = weigh(best)
+    return {"a_g": a, "b_g": b, "n_g": float(best)} if share > max(LEAST, OF_CHANCE / count) else {}
 
 
 def move_zero(experiment: FitExperiment, z: Vector, ripple: Mapping[str, float], state: str) -> Mapping[str, float]:

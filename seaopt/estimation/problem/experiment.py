@@ -185,7 +185,7 @@ class Experiment:
         if not plant.followed or not plant.moves:
             return plant
         values = plant.complete(self.apply_own(params))
-        fine = all(is_fine(self.log, each.state, values[each.wave].value) for each in plant.followed.values())
+        fine = all(values[each.wave].value <= find_finest(self.log, each.state) for each in plant.followed.values())
         return follow_readings(plant) if fine else plant
 
     def read(self, state: str) -> Signal:
@@ -413,13 +413,15 @@ class Experiment:
         return (whole.start + cut_into_shots(whole.stop - whole.start, self.shots)).tolist()
 
 
-def is_fine(log: Log, state: str, wave: float) -> bool:
-    """Tell whether a log has a state, with noise and steps of a small part of a wave of so many radians per unit."""
+def find_finest(log: Log, state: str) -> float:
+    """Return how many radians per unit a wave over a state may have, so that noise and steps of what a log has of it
+    are a small part of the wave; zero where it has none.
+    """
     values = log[state][np.isfinite(log[state])] if state in log.signals else np.zeros(0)
     if values.size < FEWEST_READ or is_constant(values):
-        return False
+        return 0.0
     third = 1.4826 * float(np.median(np.abs(np.diff(values, 3)))) / np.sqrt(20.0)  # of white noise; motion is slower
-    return wave * max(third, find_quantisation(values) / np.sqrt(12.0)) <= ROUGH
+    return ROUGH / max(third, find_quantisation(values) / np.sqrt(12.0), 1e-300)
 
 
 def is_constant(values: Signal) -> bool:

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.estimation.judgement.ripple_search import find_followed_ripple
+from seaopt.estimation.problem.fit_problem import pose_problem
+from seaopt.estimation.problem.losses import Squares
 from seaopt.plants.plant import follow_readings
 from tests.actuator_logs import drive, integrate
 
@@ -71,6 +74,17 @@ def test_cogging_is_found_and_what_follows_is_right():
     assert size == pytest.approx(math.hypot(COGS["a_g"], COGS["b_g"]), rel=0.03)
     for name in ("J_m", "b_r", "f_c", "k_s"):
         assert best.parameters[name] == pytest.approx(TRUTH[name], rel=0.01), name
+
+
+def test_the_wave_number_is_found_at_values_that_are_far_off():
+    """No simulation is asked: with an inertia and a friction of half, the force that the motion lacks has the waves."""
+    experiment, params = pose(record())
+    params = params.update(J_m=1.2e-5, f_c=0.01, k_s=400.0)
+    problem = pose_problem((experiment,), params, loss=Squares())
+    (posed,), rows = problem.experiments, slice(0, len(experiment.log))
+    found = find_followed_ripple(posed, params, rows, problem.unknowns.start)
+    assert found["n_g"] == pytest.approx(COGS["n_g"], rel=1e-3)
+    assert math.atan2(found["b_g"], found["a_g"]) == pytest.approx(math.atan2(COGS["b_g"], COGS["a_g"]), abs=0.3)
 
 
 def test_the_model_with_its_own_position_is_the_same_physics():
