@@ -153,6 +153,51 @@ def responses(
     ]
 
 
+def conditioned_responses(
+    inputs: Sequence[Float[np.ndarray, " n"]],
+    outputs: Sequence[Float[np.ndarray, " n"]],
+    period: float,
+    *,
+    stretch_s: float,
+) -> list[list[FrequencyResponse]]:
+    """Return the responses of outputs to each of several inputs that move together, input by input.
+
+    They are those of one regression on all of them, line by line, and their coherences the partial ones: what an input
+    alone explains of what the others leave (Bendat and Piersol, ch. 7). Inputs that follow each other have little.
+    """
+    length = max(round(stretch_s / period), 16)
+    window, starts = welch.hann(length), welch.list_starts([slice(0, inputs[0].size)], length)
+    if len(starts) <= len(inputs):
+        raise LogError(f"{inputs[0].size} samples are too few for segments of {length * period:g} s; use a longer log")
+
+    def average(left: Any, right: Any) -> Any:
+        """Return the averaged cross spectra of each of one side with each of the other, lines first."""
+        return np.einsum("asm,bsm->mab", np.conj(left), right) / len(starts)
+
+    u, y = (
+        np.stack([welch.transform(np.stack([x[s : s + length] for s in starts]), window)[:, 1:] for x in channels])
+        for channels in (inputs, outputs)
+    )
+    inverse = np.linalg.pinv(average(u, u), hermitian=True)
+    cross = average(u, y)
+    response = inverse @ cross
+    left = np.real(np.einsum("mbb->mb", average(y, y)) - np.einsum("mab,mab->mb", np.conj(cross), response))
+    alone = np.abs(response) ** 2 / np.maximum(np.real(np.einsum("maa->ma", inverse)), 1e-300)[:, :, None]
+    coherence = alone / np.maximum(alone + np.maximum(left, 0.0)[:, None, :], 1e-300)
+    return [
+        [
+            FrequencyResponse(
+                frequency_hz=np.fft.rfftfreq(length, period)[1:],
+                response=response[:, i, o],
+                coherence=coherence[:, i, o],
+                averages=len(starts) - len(inputs) + 1,
+            )
+            for o in range(len(outputs))
+        ]
+        for i in range(len(inputs))
+    ]
+
+
 def _power(spectra: Complex[np.ndarray, "d m"]) -> Lines:
     parts = spectra.view(np.real(spectra).dtype)  # real and imaginary, side by side
     return np.sum(np.einsum("dm,dm->m", parts, parts).reshape(-1, 2), axis=1)

@@ -6,6 +6,7 @@ from scipy.signal import coherence, csd, welch
 
 import seaopt as so
 from seaopt.errors import LogError
+from seaopt.frequency.response import conditioned_responses
 
 
 def test_h1_and_coherence_are_scipys():
@@ -36,3 +37,20 @@ def test_too_little_is_said():
         so.h1(np.ones(10), np.ones(10), 0.01)
     with pytest.raises(LogError, match="constant"):
         so.h1(np.ones(1000), np.ones(1000), 0.01)
+
+
+def test_inputs_that_move_together_have_the_responses_of_one_regression():
+    """Of gains, exactly, however alike the inputs; one that does nothing has no coherence beside noise."""
+    rng = np.random.default_rng(3)
+    first, noise = rng.normal(size=(2, 8000))
+    second = 0.8 * first + 0.6 * rng.normal(size=8000)
+    (of_first, idle), (of_second, alone) = conditioned_responses(
+        (first, second), (3.0 * first - 2.0 * second, second + noise), 1 / 400, stretch_s=0.5
+    )
+    assert np.allclose(of_first.response, 3.0, rtol=1e-9) and np.allclose(of_second.response, -2.0, rtol=1e-9)
+    assert np.min(of_first.coherence) > 0.999
+    assert np.mean(idle.coherence) < 2.0 / of_first.averages + 0.02
+    # What is left of the second input beside the first has 0.36 of its power, against noise of power one.
+    assert np.mean(alone.coherence) == pytest.approx(0.36 / 1.36, abs=0.05)
+    with pytest.raises(LogError, match="too few"):
+        conditioned_responses((first, second), (first,), 1 / 400, stretch_s=15.0)

@@ -8,6 +8,7 @@ given values, screened, and the best are refined.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from seaopt.errors import LogError
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.shapes import ParameterVector, Vector
-from seaopt.frequency.response import FrequencyResponse, responses
+from seaopt.frequency.response import FrequencyResponse, conditioned_responses, responses
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import remove_friction
 from seaopt.plants.sensors.difference import read_positions
@@ -50,11 +51,12 @@ class _Target:
 
 def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple[list[Vector], bool]:
     """Return unknowns with shared parameters that match the frequency responses, the best first, and whether it does.
-    None of them where no experiment has a usable response: several excited inputs, gaps, or no coherence.
+    None of them where no experiment has a usable response: gaps, or no coherence. Inputs that move together have one
+    each, of what the others leave.
     """
     unknowns = problem.unknowns
-    usable = (_measure_target(experiment, problem.params) for experiment in problem.experiments)
-    targets = [target for target in usable if target is not None]
+    shared = unknowns.start[: unknowns.shared]
+    targets = [target for each in problem.experiments for target in _measure_targets(each, problem.params, shared)]
     if not targets:
         return [], False
     every = (unknowns.start, unknowns.low, unknowns.high, unknowns.prior_std)
@@ -74,21 +76,37 @@ def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple
     return guesses, refined[0][0] <= enough
 
 
-def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target | None:
-    data, log, band_hz = experiment.data, experiment.data.log, experiment.band_hz
+def _measure_targets(experiment: FitExperiment, params: ParameterSet, theta: ParameterVector) -> Iterator[_Target]:
+    """Yield what there is to match of an experiment, for each of its inputs that moves: of several those to which the
+    plant responds at `theta`, as it does not where it rests to the voltage of a supply.
+    """
+    data, log = experiment.data, experiment.data.log
     active = [n for n in data.plant.inputs if n in log.signals and np.ptp(log[n]) > 0.0]
-    if len(active) != 1 or len(data.log_segments) != 1:
-        return None
+    if not active or len(data.log_segments) != 1:
+        return
     whole = [o for o, output in enumerate(data.outputs) if np.all(np.isfinite(log[output]))]
-    measured = [log[data.outputs[o]] for o in whole]
+    measured, stretch_s = [log[data.outputs[o]] for o in whole], _choose_window(len(log)) * log.period
     try:
-        stretch_s = _choose_window(len(log)) * log.period
-        estimated = responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)
+        if len(active) == 1:
+            estimated = [responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)]
+        else:
+            estimated = conditioned_responses([log[n] for n in active], measured, log.period, stretch_s=stretch_s)
     except LogError:
-        return None
+        return
+    for name, estimates in zip(active, estimated, strict=True):
+        target = _choose_target(experiment, params, name, dict(zip(whole, estimates, strict=True)))
+        if target is not None and (len(active) == 1 or np.isfinite(_misfit([target], theta)[0])):
+            yield target
+
+
+def _choose_target(
+    experiment: FitExperiment, params: ParameterSet, name: str, estimated: Mapping[int, FrequencyResponse]
+) -> _Target | None:
+    """Return the coherent lines of the responses to an input, by output, beside the model of them."""
+    data, log, band_hz = experiment.data, experiment.data.log, experiment.band_hz
     chosen: dict[int, tuple[FrequencyResponse, Int[np.ndarray, "..."]]] = {}
     low, high = band_hz if band_hz is not None else (0.0, np.inf)
-    for o, estimate in zip(whole, estimated, strict=True):
+    for o, estimate in estimated.items():
         f = estimate.frequency_hz
         good = (estimate.coherence > 0.5) & (f > low) & (f < min(high, 0.4 / log.period))
         if np.count_nonzero(good) >= 8:
@@ -118,7 +136,7 @@ def _measure_target(experiment: FitExperiment, params: ParameterSet) -> _Target 
     return _Target(
         model=model,
         index=experiment.theta.tolist(),
-        input=list(data.plant.inputs).index(active[0]),
+        input=list(data.plant.inputs).index(name),
         outputs=list(chosen),
         s=s,
         shift=shift,
