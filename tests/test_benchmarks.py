@@ -70,6 +70,14 @@ def test_laws_that_logs_refuse_though_they_are_fine_are_counted_with_a_bound(mon
     ]
 
 
+def test_only_what_repeats_with_a_periodic_input_looks_like_a_response(monkeypatch):
+    monkeypatch.setattr(sys, "path", sys.path.copy())
+    noise = load_script("judge/noise", monkeypatch)
+    logs, share = noise.count_outside("periodic", "lag_5_hz", 4, 8.0)
+    assert logs == 0 and 0.02 < share < 0.06
+    assert noise.count_outside("periodic", "hum", 4, 15.0)[0] == 4  # at a line of it
+
+
 EMPS = {"M": 95.1, "F_v": 203.5, "F_c": 20.39, "O": -3.165}
 BELT = {"K": 36.0, "b": 20.0, "k_m": 367.0, "k_p": 142.0, "c": 0.003}
 SILVERBOX = {"w": 428.0, "zeta": 0.0228, "g": 0.5, "a_2": 0.1, "a_3": 2.0, "o": 1e-3}

@@ -88,7 +88,7 @@ def make_case(actuator: Actuator, seed: int, options: argparse.Namespace) -> dic
 
 
 def play(actuator: Actuator, controller: so.Controller, rms: float, rng: np.random.Generator) -> dict[str, Any]:
-    """Return Ms of the loop around the actuator at two amplitudes, and without its dry friction, and a step."""
+    """Return Ms of the loop around the actuator at two amplitudes, what a step does, and whether any of it is bad."""
     limit = controller.spec.level("max_sensitivity")
     peaks = [measure_ms(actuator, controller, share * rms, rng) for share in SHARES]
     overshoot, left = play_step(actuator, controller)
