@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
 from types import NoneType
 from typing import Any, Literal
 
@@ -32,7 +34,9 @@ from seaopt.records import Result, record
 from seaopt.robustness.certificate.cases import CONFIDENCE, check_numbers
 from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
+from seaopt.robustness.certificate.relief import Relief, find_relief
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
+from seaopt.robustness.certificate.reserve import MOST_RESERVE, Look, find_reserve, look_at_draws
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import place_values
@@ -84,6 +88,8 @@ class JointTuning(Result):
     rounds : tuple of Round
     robust_to : mapping of name to (plant, parameters) or MeasuredResponse
         Every plant besides the design plant on which the last controller had to keep its limits.
+    relief : Relief, optional
+        Of one law that breaks its limits with what it compensates: what would do.
     """
 
     status: Literal["certified", "infeasible", "stuck", "rounds"]
@@ -91,6 +97,7 @@ class JointTuning(Result):
     certificate: Certificate | None
     rounds: tuple[Round, ...]
     robust_to: Witnesses
+    relief: Relief | None = None
 
     @property
     def met(self) -> bool:
@@ -99,7 +106,11 @@ class JointTuning(Result):
 
     @property
     def explanation(self) -> str:
-        """One line: why it is not certified; empty if it is."""
+        """One line: why it is not certified, and where its terms are why what would do; empty if it is."""
+        return "; ".join(filter(None, (self._refusal, "" if self.relief is None else str(self.relief))))
+
+    @property
+    def _refusal(self) -> str:
         if self.status == "certified":
             return ""
         if self.certificate is None:
@@ -206,7 +217,7 @@ def tune_certified(
     fitted = settled.parameters if isinstance(settled, Fit) else settled
     values = (others or ParameterSet()).with_parameters(*fitted.values())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
-    share = 1.0 - (1.0 - confidence) / rounds
+    share, asked = 1.0 - (1.0 - confidence) / rounds, spec
     finished: list[Round] = []
     for number, part in enumerate(divide(progress, *(1.0 for _ in range(rounds))), start=1):
         tuning, certifying = divide(prefix(part, f"round {number}"), TUNING, CERTIFYING)
@@ -237,21 +248,59 @@ def tune_certified(
         added = _list_new_witnesses(certificate, [(plant, values), *pairs], number)
         plants_met = 1 + len(witnesses)
         made: dict[str, Any] = {"controller": controller, "certificate": certificate}
+        needed = find_reserve(spec, [] if certificate is None or certificate.passed else _list_over(certificate))
         finished.append(Round(number=number, plants=plants_met, added=(*added,), **made))
         if certificate is None:
             status = "infeasible"
         elif certificate.passed:
             status = "certified"
-        elif not added:
+        elif not added or needed > MOST_RESERVE:
             status = "stuck"
         elif number == rounds:
             status = "rounds"
         else:
-            witnesses |= added
+            witnesses, spec = witnesses | added, replace(spec, reserve=needed)
             continue
+        relief = None
+        if status != "certified" and over is None:
+
+            def tune_at(bandwidth_hz: float) -> Controller:
+                law = tune(plant, values, replace(asked, bandwidth_hz=bandwidth_hz), robust_to, draws=draws)
+                return law if complete is None else complete(law)
+
+            look = partial(
+                look_at_draws,
+                plants=plants,
+                parameters=parameters,
+                ranges=ranges or {},
+                others=others or ParameterSet(),
+            )
+            relief = _find_relief(finished, tune_at, look)
         progress(f"{status} after {format_count(number, 'round')}", 1.0)
-        return JointTuning(status=status, rounds=tuple(finished), robust_to=witnesses, **made)
+        return JointTuning(status=status, rounds=tuple(finished), robust_to=witnesses, relief=relief, **made)
     raise AssertionError("the last round has a status")
+
+
+def _list_over(certificate: Certificate) -> list[Look]:
+    """Return the worst cases that break a limit, beside what the law alone uses there."""
+    looks = (
+        Look.of_law(place.controller, case)
+        for place in certificate.places or (certificate,)
+        for case in place.worst.values()
+    )
+    return [each for each in looks if each.is_over]
+
+
+def _find_relief(
+    rounds: Sequence[Round], tune_at: Callable[[float], Controller], look: Callable[[Controller], Mapping[str, Look]]
+) -> Relief | None:
+    """Return what would do in place of the first law that what it feeds back besides takes beyond a limit."""
+    for each in rounds:
+        law, certificate = each.controller, each.certificate
+        beyond = [] if certificate is None else _list_over(certificate)
+        if isinstance(law, Controller) and any(case.needed for case in beyond):
+            return find_relief(law, tune_at, look)
+    return None
 
 
 def _list_new_witnesses(

@@ -30,7 +30,7 @@ from seaopt.robustness.certificate.cases import Cases, pose
 from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Column, Plants, Points, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE, severities
-from seaopt.robustness.uncertainty.worst import Worst, find_worst
+from seaopt.robustness.uncertainty.worst import Worst, find_worst, measure_worst
 
 LOOKED_AT, LOOK_STREAM = 64, 0x100C  # draws of a look, and their seed, which no certificate has
 SEARCHES = 4  # of each plant, at values of a schedule
@@ -50,6 +50,11 @@ class Look:
     worst: Worst
     alone: float
 
+    @classmethod
+    def of_law(cls, law: Controller, worst: Worst) -> Look:
+        """Return a worst case of a law, and what the law alone uses there."""
+        return cls(worst=worst, alone=measure_worst(_strip(law), worst[0], worst[1], worst.parameters).severity)
+
     @property
     def is_over(self) -> bool:
         """Whether it breaks Ms, Mt or, where neither is asked, stability."""
@@ -57,8 +62,9 @@ class Look:
 
     @property
     def needed(self) -> float:
-        """The reserve with which the law alone leaves room for what uses more; none where that makes it unstable."""
-        return 0.0 if self.worst.severity >= UNSTABLE else 1.0 - self.alone / self.worst.severity + ROOM
+        """The reserve with which the law alone leaves room for what uses more; 1 where that makes it unstable."""
+        more = 1.0 - self.alone / self.worst.severity
+        return min(more + ROOM, 1.0) if more > 1e-6 else 0.0
 
 
 def look_at_draws(
@@ -87,8 +93,13 @@ def _look_at_plant(posed: Sequence[Cases], tuned: Sequence[Cases], name: str, po
         most = np.maximum(most, [_rank_one(each, name, found[at]) for each in posed])
         most[at] = found[at].severity
     worst = max(found.values(), key=lambda case: case.severity)
-    alone = (replace(each, controller=replace(each.controller, compensation=None, outer=None)) for each in tuned)
+    alone = (replace(each, controller=_strip(each.controller)) for each in tuned)
     return Look(worst=worst, alone=max(_rank_one(each, name, worst) for each in alone))
+
+
+def _strip(law: Controller) -> Controller:
+    """Return a law without what it feeds back besides."""
+    return replace(law, compensation=None, outer=None)
 
 
 def _rank(cases: Cases, name: str, values: Mapping[str, Column]) -> Column:
