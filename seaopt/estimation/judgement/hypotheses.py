@@ -256,7 +256,11 @@ def measure_sizes(fit: Fit) -> Sizes:
 
 
 def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment) -> Sizes:
-    plant, log = experiment.plant, experiment.log
+    plant, log = experiment.follow(fit.parameters), experiment.log
+    for name in plant.read_inputs:
+        state = plant.followed[name].state
+        signal = replace(log.signals[state], name=name, values=experiment.read(state))
+        log = replace(log, signals={**log.signals, name: signal})
     number, longest = max(enumerate(log.segments), key=lambda pair: pair[1].stop - pair[1].start)  # no gap is crossed
     log = log.between(*(log.time[[longest.start, longest.stop - 1]] - log.time[0]))
     params = plant.complete(experiment.apply_own(fit.parameters))

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.estimation.judgement.hypotheses import measure_sizes
 from seaopt.estimation.judgement.ripple_search import find_followed_ripple
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
@@ -85,6 +86,14 @@ def test_the_wave_number_is_found_at_values_that_are_far_off():
     found = find_followed_ripple(posed, params, rows, problem.unknowns.start)
     assert found["n_g"] == pytest.approx(COGS["n_g"], rel=1e-3)
     assert math.atan2(found["b_g"], found["a_g"]) == pytest.approx(math.atan2(COGS["b_g"], COGS["a_g"]), abs=0.3)
+
+
+def test_sizes_are_of_the_measured_motion():
+    """What else such a model lacks is looked for from sizes: its own motion cannot even be simulated to a tolerance."""
+    experiment, params = pose(record(), parts=("cogging",), **COGS)
+    sizes = measure_sizes(so.fit([experiment], params, diagnostics=False))
+    speed = np.quantile(np.abs(np.gradient(swing()[1], 1.0 / RATE_HZ)), 0.999)
+    assert sizes.speed == pytest.approx(speed, rel=0.01)
 
 
 def test_the_model_with_its_own_position_is_the_same_physics():
