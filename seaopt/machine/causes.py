@@ -254,7 +254,7 @@ def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
     """Yield limits, guards and terms that are others, or left out."""
     law, linear, ticks = setting.law, setting.linear, setting.ticks
     reached, unit = float(np.max(np.abs(ticks.command))), setting.controller.command.unit
-    if not math.isclose(reached, law.command_limit, rel_tol=1e-3):
+    if np.any(find_limited(ticks)) and not math.isclose(reached, law.command_limit, rel_tol=1e-3):
         change = lambda given: replace(given, law=limit_law(given.law, reached))  # noqa: E731
         yield Alternative(kind="limit", what="command", value=reached, unit=unit, change=change)
     if law.gate is not None:

@@ -133,6 +133,8 @@ def take_ticks(
             f"{join_words(names)}; log at least {FEWEST} ticks without a gap, better some periods of the reference"
         )
     table, count = table[rows], len(controller.signals)
+    if not np.any(np.ptp(table, axis=0)):
+        raise LogError(f"{log.source}: nothing moves in it, which any law may have made; play a reference that moves")
     place = table[:, -1] if placed else None if over is None else np.full(len(table), at)
     further = 2 + count + len(controller.further)
     ticks = Ticks(

@@ -46,6 +46,14 @@ def test_the_size_of_a_fault_is_found_beside_what_was_certified(controller, benc
     assert np.isclose(factors["k"], 0.8, atol=0.01) and first.high - first.low < 0.05
 
 
+def test_a_fault_is_named_beside_a_range_that_begins_at_the_nominal_value(controller, bench):
+    log = bench.log(scale(stiffness=0.8), REFERENCE)
+    for eta in ((0.97, 1.0), (1.0, 1.03)):
+        differences = so.accept(controller, [log], uncertainty=so.plants.thor(), ranges={"eta": eta}).differences
+        first = differences.found[0]
+        assert "k" in (first.name, *first.alike) and first.explains > 0.99, differences
+
+
 def test_a_value_that_was_drawn_is_a_cause_of_its_own_whole_size(controller, bench):
     first = accept(controller, bench.log(scale(per_ampere=0.7), REFERENCE)).found[0]
     assert {"eta", "K_tau"} <= {first.name, *first.alike} and np.isclose(first.value, 0.7, atol=0.02), first

@@ -138,6 +138,21 @@ def test_what_a_log_lacks_is_said_with_what_to_record(controller, bench):
         so.accept(controller, [log.between(0.0, 0.02)])
 
 
+def test_a_log_in_which_nothing_moves_tells_no_law(controller):
+    still = {"reference": np.full(1000, 300.0), "F1": np.full(1000, 300.0), "I": np.full(1000, 0.3)}
+    with pytest.raises(so.SeaoptError, match="nothing moves in it"):
+        so.accept(controller, [so.Log.from_arrays(time=1e-3 * np.arange(1000), **still)])
+
+
+def test_a_command_of_its_own_is_not_called_a_limit(controller, bench):
+    log = bench.log(Machine(), REFERENCE[:4000])
+    sine = 0.3 + 0.05 * np.sin(0.05 * np.arange(4000))
+    result = so.accept(
+        controller, [so.Log.from_arrays(time=log.time, reference=log["reference"], F1=log["F1"], I=sine)]
+    )
+    assert not result.replayed and "limit" not in {cause.kind for cause in result.replays[0].causes}
+
+
 def test_a_place_that_is_no_number_is_refused(controller, bench):
     log = bench.log(Machine(), REFERENCE[:200])
     with pytest.raises(so.SeaoptError, match="at = True is a bool"):

@@ -162,7 +162,7 @@ class _Fit:
             off = (measured - respond(x)) / std
             return np.concatenate([off.real, off.imag, x[k:] / leeway.std])
 
-        first = np.array([*start, *np.zeros(leeway.std.size)])
+        first = np.array([*start, *(0.5 * (leeway.low + leeway.high))])  # at an edge the search would stay
         if not first.size:
             left = 0.5 * float(np.sum(errors(first) ** 2))
             return _Best(sizes=first, std=math.inf, left=left, response=respond(first))

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.errors import LogError
+from seaopt.formatting import format_count
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
@@ -120,8 +121,8 @@ def cut_periods(controller: Controller, ticks: Ticks) -> Blocks:
         reached = len(starts) - len(free)
         why = f"in {reached} of them the command is at its limit: lower the amplitude" if reached else "record more"
         raise LogError(
-            f"{ticks.source}: {len(free)} periods of {period * seconds:.3g} s are whole, after the first of each "
-            f"stretch; {why}, at least 3 periods are needed"
+            f"{ticks.source}: it has {format_count(len(free), 'whole period')} of {period * seconds:.3g} s after the "
+            f"first of each stretch; {why}, at least 3 periods are needed"
         )
     return _transform(controller, ticks, period, free, len(starts) - len(free))
 
