@@ -10,7 +10,7 @@ import pytest
 import scipy.signal
 
 import seaopt as so
-from seaopt.control import runnable, tune_schedule
+from seaopt.control import MPCSpec, force_mpc, runnable, tune_schedule
 from seaopt.errors import LogError
 from seaopt.files import to_json
 from seaopt.frequency.residual import find_feedback, measure_residual
@@ -113,6 +113,18 @@ def test_mode_that_the_model_lacks_fails_by_the_name_of_the_log(stand, thor, fit
 def test_mode_that_makes_the_loop_unstable_is_refuted(stand, fit_to, controller):
     (row,) = rows_of(certify(controller, stand, fit_to((1, 0.2))))
     assert not row.met
+
+
+def test_predictive_control_fails_by_the_name_of_a_log_too(stand, fit_to):
+    fit = fit_to((1, 0.0), validate=[(2, 0.0), (3, 0.3)])
+    spec = MPCSpec(current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0)
+    mpc = force_mpc(stand, fit.parameters, spec)
+    certificate = so.certify(mpc, {"stand": stand}, fit, samples=4, runs=1, simulations=False)
+    assert [(row.plant, row.met) for row in rows_of(certificate)] == [
+        ("log:chirp1", True),
+        ("log:other2", True),
+        ("log:other3", False),
+    ]
 
 
 def test_right_model_passes_and_fitted_samples_confirm_nothing(stand, controller, right):
