@@ -57,7 +57,7 @@ from seaopt.robustness import (
     linear_controller,
     tune_certified,
 )
-from seaopt.robustness.certificate.reserve import Look, keep_reserve, look_at_draws
+from seaopt.robustness.certificate.retuning.reserve import Look, keep_reserve, look_at_draws
 from seaopt.robustness.verification.verification import list_readings
 from seaopt.signals import Signal
 from seaopt.simulation import simulate

@@ -5,8 +5,8 @@ from seaopt.robustness.bounds.stretch import StretchBound
 from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns, linear_controller
-from seaopt.robustness.certificate.joint import JointTuning, Round, tune_certified
 from seaopt.robustness.certificate.requirement import Requirement
+from seaopt.robustness.certificate.retuning.joint import JointTuning, Round, tune_certified
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
 from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Uncertainty, check_ranges, combine_uncertainty, place_value

@@ -14,7 +14,7 @@ from seaopt.control.tuning.tuner import make_task
 from seaopt.problem import certify_problem, tune_problem
 from seaopt.progress import ignore
 from seaopt.robustness import JointTuning
-from seaopt.robustness.certificate.reserve import Look, keep_reserve
+from seaopt.robustness.certificate.retuning.reserve import Look, keep_reserve
 from seaopt.robustness.certificate.simulated import SIMULATIONS
 from seaopt.robustness.uncertainty.worst import Witness, Worst
 from tests.checks import leave_out

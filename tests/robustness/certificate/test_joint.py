@@ -12,7 +12,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.errors import ControlError
 from seaopt.robustness import tune_certified
-from seaopt.robustness.certificate.joint import _list_new_witnesses
+from seaopt.robustness.certificate.retuning.joint import _list_new_witnesses
 from tests.pages import unbroken
 
 SPEC = so.ControllerSpec(

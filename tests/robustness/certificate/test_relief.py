@@ -10,8 +10,8 @@ import pytest
 
 import seaopt as so
 from seaopt.control import Impedance, add_impedance
-from seaopt.robustness.certificate.relief import Relief, find_relief
-from seaopt.robustness.certificate.reserve import look_at_draws
+from seaopt.robustness.certificate.retuning.relief import Relief, find_relief
+from seaopt.robustness.certificate.retuning.reserve import look_at_draws
 from tests.control.running.test_fed_back import HELD, KNEE, TS, VALUES, close_by_hand
 
 MASSES = (2.7, 3.2)

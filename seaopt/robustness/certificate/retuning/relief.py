@@ -14,7 +14,7 @@ from seaopt.control import Controller
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.records import record
-from seaopt.robustness.certificate.reserve import Look
+from seaopt.robustness.certificate.retuning.reserve import Look
 
 HALVINGS = 6
 SLOWER = (0.8, 0.65, 0.5, 0.35)  # of the bandwidth asked

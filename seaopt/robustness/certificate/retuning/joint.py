@@ -34,9 +34,9 @@ from seaopt.records import Result, record
 from seaopt.robustness.certificate.cases import CONFIDENCE, check_numbers
 from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
-from seaopt.robustness.certificate.relief import Relief, find_relief
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
-from seaopt.robustness.certificate.reserve import MOST_RESERVE, Look, find_reserve, look_at_draws
+from seaopt.robustness.certificate.retuning.relief import Relief, find_relief
+from seaopt.robustness.certificate.retuning.reserve import MOST_RESERVE, Look, find_reserve, look_at_draws
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import place_values

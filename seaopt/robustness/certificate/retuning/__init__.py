@@ -1,0 +1,1 @@
+"""Tuning until certified: the reserve that draws need, rounds of tuning and certifying, what must give."""
