@@ -80,7 +80,7 @@ def judge(
 
     `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
     not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's;
-    `evaluations`: what the fit took, of which the search for causes may take five times as many, and five times
+    `evaluations`: what the fit took, of which the search for causes may take about five times as many, and five times
     `EVALUATIONS` where it took fewer: each of the hypotheses takes several, however soon the fit was there.
     """
     minimum = fit.require_minimum("judge")
@@ -131,7 +131,9 @@ def judge(
     if search.partial is not None:
         fit, findings = _reach(fit, findings, error, search.partial)
     if wrong or search.able:
-        spent, budget = count_evaluations() - begun, (OF_HYPOTHESES + OF_CAUSES) * evaluations
+        spent = count_evaluations() - begun
+        # A search of hypotheses that takes more than its share leaves the other causes theirs.
+        budget = max((OF_HYPOTHESES + OF_CAUSES) * evaluations - spent, OF_CAUSES * evaluations)
         causes = find_causes(
             fit,
             residuals,
@@ -140,8 +142,8 @@ def judge(
             poor=little or fit.status == "not_identifiable",
             noticed=noticed,
             hypotheses=search.able,
-            budget=max(1, budget - spent),
-            progress=divide(trying, spent, max(1, budget - spent))[1],
+            budget=budget,
+            progress=divide(trying, spent, budget)[1],
         )
         named = list(_name_causes(fit, causes, suspects))
         told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)

@@ -85,6 +85,8 @@ def _measure_targets(experiment: FitExperiment, params: ParameterSet, theta: Par
     if not active or len(data.log_segments) != 1:
         return
     whole = [o for o, output in enumerate(data.outputs) if np.all(np.isfinite(log[output]))]
+    if not whole:
+        return
     measured, stretch_s = [log[data.outputs[o]] for o in whole], _choose_window(len(log)) * log.period
     try:
         if len(active) == 1:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -77,3 +79,38 @@ def test_an_input_to_which_a_plant_at_rest_does_not_respond_is_no_target():
     guesses, matched = guess_from_responses(problem, np.random.default_rng(0))
     assert matched
     assert dict(zip(problem.unknowns.names, guesses[0], strict=False))["k"] == pytest.approx(900.0, rel=0.2)
+
+
+def _cut(log, rows):
+    return so.Log.from_arrays(time=log.time[rows], **{name: log[name][rows] for name in log.signals})
+
+
+def _lose(*names):
+    """Return what makes a log of one of which some channels miss a sample in the middle."""
+
+    def change(log):
+        columns = {name: log[name].copy() for name in log.signals}
+        for name in names:
+            columns[name][SAMPLES // 2] = np.nan
+        return so.Log.from_arrays(time=log.time, **columns)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "guessed"),
+    [
+        (_lose("x1"), True),
+        (_lose("x1", "x2"), False),
+        (lambda log: _cut(log, np.r_[0:2000, 2100:SAMPLES]), False),
+        (lambda log: _cut(log, slice(0, 20)), False),
+        (lambda log: _cut(log, slice(0, 60)), False),
+    ],
+    ids=["one output missing", "no output whole", "a gap", "less than a segment", "60 samples"],
+)
+def test_a_log_without_usable_responses_has_no_guess(change, guessed):
+    experiment, start = pose(106)
+    experiment = replace(experiment, log=change(experiment.log))
+    problem = pose_problem((experiment,), start, loss=Squares(), band_hz=None, holdout=0.0)
+    guesses, _ = guess_from_responses(problem, np.random.default_rng(0))
+    assert bool(guesses) == guessed
