@@ -91,7 +91,10 @@ def say_cause(cause: Cause) -> str:
         case "sign":
             return f"the sign of {cause.what} is turned"
         case "open loop":
-            return f"the command does not follow {cause.what}: the loop is open"
+            return (
+                f"the command does not follow {cause.what}: the loop was open; let the law make the command in each "
+                "tick of what was read, and record under a reference that moves"
+            )
         case "unit":
             return f"{cause.what} is in another unit: {value} times what it should be"
         case "factor":

@@ -11,8 +11,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from seaopt.control import Controller
+from seaopt.formatting import join_words
 from seaopt.machine.causes import Cause, find_causes, leave_open
 from seaopt.machine.decimated import SAME_RATE, LineMatch, count_ticks_per_row, match_lines
+from seaopt.machine.open_loop import find_unfollowed
 from seaopt.machine.stepped import Setting, Source, make_setting, play
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
@@ -70,6 +72,9 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
             return _describe_lines(whole, lines, ticks_per_row)
         if first is not None and first.kind == "late" and first.what == "command" and first.explains:
             late, causes, match = int(first.value or 0), (), play(changed)
+        elif (first is None or not first.explains) and (names := find_unfollowed(whole, match)):
+            what = join_words(names)
+            causes = (Cause(kind="open loop", what=what, value=None, unit="", removes=1.0, explains=True),)
     rate_hz, law_rate_hz = ticks.rate_hz, 1.0 / whole.controller.sample_time_s
     if match.met and abs(rate_hz / law_rate_hz - 1.0) > SAME_RATE:
         causes = (Cause(kind="rate", what="clock", value=rate_hz, unit="Hz", removes=1.0, explains=True),)

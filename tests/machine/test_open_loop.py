@@ -1,0 +1,72 @@
+"""A log in which something was played as the command, without the law, is told from one under any law."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import chirp, cont2discrete, lfilter
+
+import seaopt as so
+from tests.machine.simulator import Machine, multisine
+from tests.machine.test_replay import LINES, REFERENCE, cause_of
+
+N = 6000
+TIME = 1e-3 * np.arange(N)
+PLAYED = {
+    "multisine": multisine(1000, LINES, 6, 1.5, 3, bias=0.5),
+    "chirp": 1.2 * chirp(TIME, 0.5, TIME[-1], 100.0),
+    "steps": 0.5 * ((TIME // 0.5) % 4),
+    "noise": np.random.default_rng(5).normal(size=N),
+}
+REFERENCES = {"rest": 0.0 * TIME, "what was played": None, "another": multisine(1000, LINES, 6, 250.0, 9, bias=300.0)}
+
+
+def play(current, reference, noise=2.0, decimals=2, seed=1):
+    """Return the log of a current on the machine's own equation: M y'' + b y' + k y = k (force per ampere) I."""
+    m = Machine()
+    b, a, _ = cont2discrete(([m.per_ampere * m.stiffness], [m.mass, m.damping, m.stiffness]), 1e-3)
+    force = lfilter(np.ravel(b), a, current) + noise * np.random.default_rng(seed).normal(size=current.size)
+    columns = {"reference": 240.0 * current if reference is None else reference, "I": np.round(current, 4)}
+    return so.Log.from_arrays(time=1e-3 * np.arange(current.size), F1=np.round(force, decimals), **columns)
+
+
+@pytest.mark.parametrize("reference", REFERENCES)
+@pytest.mark.parametrize("played", PLAYED)
+def test_a_command_that_was_played_without_the_law_is_an_open_loop(controller, played, reference):
+    log = play(PLAYED[played], REFERENCES[reference])
+    cause = cause_of(controller, log)
+    assert (cause.kind, cause.what) == ("open loop", "F1")
+    words = str(so.accept(controller, [log]))
+    assert "does not follow F1: the loop was open" in " ".join(words.split()) and "record" in words
+
+
+def is_open(controller, log):
+    (row,) = so.accept(controller, [log]).replays
+    return any(cause.kind == "open loop" and cause.explains for cause in row.causes)
+
+
+@pytest.mark.parametrize(("law_gain", "noise"), [(1.0, 2.0), (0.5, 0.3), (0.1, 2.0), (0.02, 0.3)])
+@pytest.mark.parametrize("reference", [REFERENCE, 300.0 + 100.0 * chirp(TIME, 0.5, TIME[-1], 100.0)])
+def test_a_law_of_whatever_gain_is_not(controller, bench, reference, law_gain, noise):
+    log = bench.log(Machine(law_gain=law_gain), reference, noise=noise, decimals=2)
+    assert not is_open(controller, log)
+
+
+@pytest.mark.parametrize("changes", [{"late": 3.0}, {"every": 2.0}, {"delay_s": 2e-3}, {"sensor_range": 330.0}])
+def test_nor_is_a_law_that_is_late_or_reads_badly(controller, bench, changes):
+    log = bench.log(replace(Machine(), law_gain=0.3, **changes), REFERENCE)
+    assert not is_open(controller, log)
+
+
+def test_nor_is_a_log_at_the_limit(controller, bench):
+    reference = 4000.0 * np.sign(np.sin(0.02 * np.arange(N)))
+    for law_gain in (1.0, 0.3):
+        assert not is_open(controller, bench.log(Machine(law_gain=law_gain), reference))
+
+
+def test_readings_without_noise_tell_nothing(controller):
+    """Rounding is noise that no law saw."""
+    for decimals in (0, 9):
+        assert not is_open(controller, play(PLAYED["multisine"], 0.0 * TIME, noise=0.0, decimals=decimals))
