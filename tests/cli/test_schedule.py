@@ -100,3 +100,29 @@ def test_what_cannot_be_scheduled_is_one_line(knee, seaopt, text, old, new, word
 def test_a_sweep_of_bandwidths_is_refused(knee, seaopt):
     out = seaopt("tune", "knee.toml", "--sweep", "20:30:10")
     assert out.returncode == 2 and "controller.schedule" in out.stderr
+
+
+STAND = """schema = 1
+title = "Stand"
+parameters = { I_p = { value = 0.36, unit = "kg m^2" } }
+plant = { stand = { kind = "high_impedance" }, swing = { kind = "moving_output" } }
+robustness = { plants = ["swing"], parameters = { I_p = [0.2, 0.6] }, samples = 50 }
+[controller]
+plant = "stand"
+measured = "F1"
+bandwidth_hz = 25
+max_sensitivity = 1.6
+current_limit_A = 9.0
+"""
+SCHEDULE = 'schedule = { over = "k", points = [5e5, 8e5] }\n'
+
+
+def test_every_command_takes_what_was_tuned_with_more_of_a_reserve_than_is_asked(folder, seaopt, without_simulation):
+    """What the draws of the certificate need is taken off the limits while it is tuned, and the file says so."""
+    (folder / "stand.toml").write_text(STAND + SCHEDULE, encoding="utf-8")
+    assert seaopt("tune", "stand.toml").returncode == 0
+    path = folder / "out" / "controller.json"
+    assert json.loads(path.read_text(encoding="utf-8"))["spec"]["reserve"] == pytest.approx(0.03)
+    for command in (["certify", "stand.toml"], ["report", "stand.toml"], ["bringup", "stand.toml"], ["export", "out"]):
+        done = seaopt(*command, *(["--c", "c"] if command[0] == "export" else []))
+        assert done.returncode == 0, (command, done.stderr)
