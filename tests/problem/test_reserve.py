@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.control import tune_schedule
 from seaopt.control.laws.structures import Notch
 from seaopt.control.tuning.law_numbers import read_numbers
 from seaopt.control.tuning.tuner import make_task
@@ -97,6 +98,9 @@ def test_the_worst_of_some_rounds_is_not_kept():
     all, and one that is not met at its points: that says what can be had.
     """
     spec, stand, thor = so.ControllerSpec(bandwidth_hz=30), so.plants.high_impedance(), so.plants.thor()
+    good = replace(tune_schedule(stand, thor, spec, "J", [2e-6, 4e-6]), between=())
+    bad = replace(good, controllers=tuple(replace(law, met=False) for law in good.controllers))
+    assert good.met and not bad.met
     for severities, points_met, kept in (
         ([1.05, 1.02, 1.04], [True] * 4, 1), ([1.05, 0.99], [True] * 4, 1), ([1.05, 1.0], [True, False], 1),
         ([0.9], [True], 0), ([1.05, 1.03, 1.02, 1.01], [True] * 4, 3), ([1.3], [True], 0),
@@ -105,14 +109,14 @@ def test_the_worst_of_some_rounds_is_not_kept():
 
         def tune(spec, witnesses, near, _, made=made, points_met=points_met):
             assert near is (made[-1] if made else None) and len(witnesses) == len(made)
-            law = SimpleNamespace(met=points_met[len(made)])
-            made.append(SimpleNamespace(controllers=(law,), between=(), number=len(made)))
+            made.append(replace(good if points_met[len(made)] else bad))
             return made[-1]
 
-        def look(schedule, severities=severities):
-            used = severities[schedule.number]
+        def look(schedule, made=made, severities=severities):
+            number = next(k for k, each in enumerate(made) if each is schedule)
+            used = severities[number]
             figures = {"ms": 1.6, "mt": 1.0, "ms_hz": 40.0, "spectral_radius": 0.9, "severity": used}
-            witness = Witness(parameters={"k": 6e5 + schedule.number}, **figures)
+            witness = Witness(parameters={"k": 6e5 + number}, **figures)
             worst = Worst(stand, thor, witness, limited=True)
             return {"stand": Look(worst=worst, alone=0.8 * used if used > 1.2 else used)}
 
