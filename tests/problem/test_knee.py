@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import seaopt as so
-from seaopt.problem import stages
+from seaopt.problem import completion
 from tests.schedules import read_knee, tune_knee
 from tests.words import check_words
 
@@ -63,14 +63,14 @@ def test_critical_damping_is_the_largest_between_the_points_too(monkeypatch):
     def need(law, plant, at, stiffness, **_):
         return so.control.Impedance(stiffness=stiffness, damping=at["phi"].value)
 
-    monkeypatch.setattr(stages, "critical_impedance", need)
+    monkeypatch.setattr(completion, "critical_impedance", need)
 
     def note(law, plant, at, impedance, *, name):
         noted.append(impedance.damping)
         return law
 
     noted = []
-    monkeypatch.setattr(stages, "add_impedance", note)
+    monkeypatch.setattr(completion, "add_impedance", note)
     points, between = (
         [
             (schedule.controllers[0], values.with_parameters(so.Parameter(name="phi", value=value, unit="rad")))
@@ -78,7 +78,7 @@ def test_critical_damping_is_the_largest_between_the_points_too(monkeypatch):
         ]
         for each in ((1.0, 2.0), (2.5, 1.5))
     )
-    stages._add_impedance(problem, points, iter(between))
+    completion.add_outer_loop(problem, points, iter(between))
     assert noted == [2.5, 2.5]
 
 

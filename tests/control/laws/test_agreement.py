@@ -13,7 +13,8 @@ from seaopt.control import MPCSpec, PlausibilityGate, force_mpc, runnable
 from seaopt.control.laws.plausibility import FALSE_ALARMS, SIGMAS, Agreement
 from seaopt.errors import ControlError
 from seaopt.problem import tune_problem
-from seaopt.problem.stages import complete_controller, fit_problem
+from seaopt.problem.completion import complete_controller
+from seaopt.problem.stages import fit_problem
 from tests.c_code import CompiledLaw
 
 K, SIGMA, SIGMA_Q = 655e3, 2.0, 1e-6
