@@ -101,7 +101,7 @@ def _take_reciprocals(expression: Any, arguments: list[Any], p: Any) -> tuple[An
     """Return an expression that multiplies by a symbol where it divided by something of parameters alone, these symbols
     and what they stand for: a division takes as long as three products, and a step of order four waits for eight.
     """
-    inputs, outputs, reciprocals = [*arguments, p], [ca.SX(0)] * expression.numel(), dict[str, tuple[Any, Any]]()
+    inputs, outputs, reciprocals = [*arguments, p], [ca.SX(0)] * expression.numel(), dict[int, tuple[Any, Any]]()
     function, work = ca.Function("expression", inputs, [expression]), dict[int, tuple[Any, bool]]()  # value, varies
     for k in range(function.n_instructions()):
         operation, read, (to, *entry) = (
@@ -117,7 +117,7 @@ def _take_reciprocals(expression: Any, arguments: list[Any], p: Any) -> tuple[An
             values, varies = zip(*(work[each] for each in read), strict=True)
             if operation == ca.OP_DIV and varies == (True, False) and not values[1].is_constant():
                 symbol = ca.SX.sym(f"reciprocal{len(reciprocals)}")
-                value = values[0] * reciprocals.setdefault(str(values[1]), (symbol, 1.0 / values[1]))[0]
+                value = values[0] * reciprocals.setdefault(values[1].element_hash(), (symbol, 1.0 / values[1]))[0]
             else:
                 value = (ca.SX.unary if len(values) == 1 else ca.SX.binary)(operation, *values)
             work[to] = value, any(varies)

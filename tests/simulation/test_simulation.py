@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from unittest.mock import create_autospec
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -453,3 +454,25 @@ def test_threads_share_the_passes_that_are_kept(monkeypatch):
     finally:
         sys.setswitchinterval(interval)
     assert kept._bytes == sum(run._measure_bytes(each) for each, *_ in kept._passes.values()) <= run.KEPT_BYTES
+
+
+@pytest.mark.parametrize(("first", "second", "c"), [(1e6, 1e6 + 4.0, 0.5 - 1e6), (1.0000001, 1.0000049, 0.5)])
+def test_denominators_that_differ_in_late_digits_have_their_own_reciprocals(first, second, c):
+    two = so.Plant(
+        name="two",
+        states={"a": "m", "b": "m"},
+        inputs={"i": "A"},
+        outputs={"y": "m", "z": "m"},
+        parameters={"c": "s"},
+        f=lambda t, x, u, p: {"a": (ca.tanh(u.i) - x.a) / (p.c + first), "b": (ca.tanh(u.i) - x.b**3) / (p.c + second)},
+        h=lambda t, x, u, p: {"y": x.a, "z": x.b},
+    )
+    model = make_model(two, so.ParameterSet.of(c=(c, "s")), ("c",))
+    u = np.random.default_rng(0).normal(size=400)
+    segment = Segment(u=(u,), y=(np.zeros(400), np.zeros(400)))
+    point = Point(
+        theta=np.array([c]), offset=np.zeros(2), gain=np.ones(2), clock=Clock(period=0.01, hold="zero"), substeps=4
+    )
+    here = run_passes(model, segment, point, np.zeros(2), outputs=True).outputs
+    there = interpret_pass(model, segment, point, Weights.plain(2), 400, np.zeros(2)).outputs
+    assert here == pytest.approx(there, rel=1e-11, abs=1e-13)
