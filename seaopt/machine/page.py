@@ -38,6 +38,9 @@ NO_GAINS = (
     "The law has no gains with names (it is one's own, or predictive control): a part that is left out, or a gain "
     "that is another, is not looked for in such a log; log every tick, where all of it counts."
 )
+ONE_BY_ONE = (
+    "Each line by itself is within reach of some certified machine, but none of them explains all lines together."
+)
 EVERY_TICK = "of a log with every n-th tick"
 OPEN = {
     "terms": "terms of the law (friction, gravity, ripple) are not linear; log every tick",
@@ -272,6 +275,8 @@ def _describe_differences(differences: Differences) -> Section:
     sentences = [
         f"{inside}: the measured plant is off by {format_number(differences.misfit**0.5, 3)} times its noise (rms)."
     ]
+    if differences.each_line and not differences.inside and not any(each.kind == "range" for each in differences.found):
+        sentences.append(ONE_BY_ONE)
     if differences.nearest:
         nearest = ", ".join(f"{name} {format_number(value)}" for name, value in differences.nearest.items())
         sentences.append(f"The nearest of the certificate's draws: {nearest}.")

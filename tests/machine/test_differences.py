@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 import seaopt as so
+from seaopt.machine.differences.certified import compare
+from seaopt.machine.differences.joint import explains
 from seaopt.machine.differences.leeway import take_spread
+from seaopt.machine.response.discs import Ratio
 from seaopt.machine.stepped import make_setting, play, run_setting
 from seaopt.machine.ticks import find_edges, take_ticks
 from tests.machine.simulator import Machine
@@ -170,3 +174,43 @@ def test_a_long_log_is_allowed_the_walk_that_an_integral_makes_of_rounding(contr
         match = play(make_setting(controller, take_ticks(controller, so.Log.from_arrays(**rows))))
         ends.append(match.error[-1] / match.allowed[-1])
     assert 0.6 < np.sqrt(np.mean(np.square(ends))) < 1.5
+
+
+WIDER = {"eta": (0.7, 1.3), "b_r": (0.1 * 1.31e-4, 10.0 * 1.31e-4)}
+
+
+@pytest.mark.parametrize("ranges", [WIDE, WIDER])
+@pytest.mark.parametrize(("fault", "factor"), [("stiffness", 0.8), ("mass", 1.25)])
+def test_a_fault_within_reach_of_the_draws_at_each_line_is_outside_of_all_of_them(
+    controller, bench, ranges, fault, factor
+):
+    machine = scale(per_ampere=1.05, damping=1.5, **{fault: factor})
+    options = {"uncertainty": so.plants.thor(), "ranges": ranges}
+    result = so.accept(controller, [bench.log(machine, REFERENCE)], **options)
+    assert result.differences.each_line and not result.differences.inside
+    assert "none of them explains all lines together" in " ".join(str(result).split())
+    right = bench.log(scale(per_ampere=1.05, damping=1.5), REFERENCE)
+    assert so.accept(controller, [right], **options).differences.inside
+
+
+def test_between_the_draws_a_machine_is_found_by_going_on_from_the_nearest(controller, bench):
+    """Of eight draws none is the machine, to the noise of the log."""
+    machine, draws = scale(per_ampere=1.03, damping=1.1), np.random.default_rng(2).uniform(-1.0, 1.0, size=(8, 2))
+    rows = [{"eta": 1.0 + 0.1 * a, "b_r": 1.31e-4 * (1.0 + 0.5 * b)} for a, b in draws]
+    log = bench.log(machine, REFERENCE, noise=0.3)
+    measured = so.accept(controller, [log]).response.measured
+    differences = compare(controller, measured, [take_ticks(controller, log)], rows, 0.95)
+    assert differences.inside and differences.nearest_misfit > 100.0
+
+
+def test_the_joint_probability_of_what_is_left_is_the_one_that_is_stated(controller):
+    """Right machines are refused as often as is stated, where none of the difference is tolerated, by simulation."""
+    rng, blocks, m, alpha = np.random.default_rng(4), 6, 20, 0.1
+    truth = np.exp(-1j * np.linspace(0.1, 3.0, m))
+    refused = 0
+    for _ in range(2000):
+        noise = rng.normal(size=(blocks, m)) + 1j * rng.normal(size=(blocks, m))
+        ratio = Ratio(numerator=truth + 1e3 * noise, denominator=np.ones((blocks, m)))  # 2 % of it is nothing then
+        lines = SimpleNamespace(response=ratio.value, std=ratio.std, ratios=[ratio])
+        refused += not explains(lines, truth, alpha)
+    assert abs(refused / 2000 - alpha) < 0.025

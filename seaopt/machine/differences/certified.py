@@ -1,8 +1,9 @@
 """Whether the machine is one of those that were certified, and if not, what differs.
 
 **Inside what was certified** is a machine whose response at every line is no further from the nominal one than a draw
-of the certificate is, but for the disc of the measurement and 2 % of the response. The nearest draw is the one of the
-least misfit, sum over the lines of the square of what it is off by, over the measurement's std.
+of the certificate is, but for the disc of the measurement and 2 % of the response, and of which one machine within the
+spread of the draws explains all lines together (`joint`). The nearest draw is the one of the least misfit, sum over the
+lines of the square of what it is off by, over the measurement's std.
 
 A sensor is at its range where readings pile up at an edge of what was read while the command moves on.
 """
@@ -16,6 +17,7 @@ import numpy as np
 from seaopt.control import Controller
 from seaopt.machine.differences.comparison import Comparison
 from seaopt.machine.differences.explanations import Difference, explain
+from seaopt.machine.differences.joint import TOLERATED, is_one_of
 from seaopt.machine.differences.leeway import take_spread
 from seaopt.machine.response.periods import shorten
 from seaopt.machine.response.verdicts import Measured, has_dry_friction
@@ -24,7 +26,6 @@ from seaopt.records import record
 from seaopt.robustness.uncertainty.worst import place_values
 
 SIMULATED = 60  # draws that are simulated, with dry friction
-TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
 MOVES = 0.5  # of the rows in which a reading stays at an edge: the command is another than in the one before
 Values = Mapping[str, float]
 
@@ -34,6 +35,7 @@ class Differences:
     """How the measured plant differs from the certified one."""
 
     inside: bool  # the machine is one of those that were certified
+    each_line: bool  # each line by itself is within reach of them
     misfit: float  # mean square of the difference over its std; 1 is noise
     off: float  # largest share of the response by which it differs, beyond its disc
     off_hz: float | None
@@ -72,13 +74,16 @@ def compare(
     share = left / np.abs(model)
     flat = [*_list_clipped(controller, logs)]
     at = {name: each.value for name, each in nominal.items()}
-    found = [*flat, *explain(comparison, beside, model, take_spread(draws, at))]
+    spread = take_spread(draws, at)
+    found = [*flat, *explain(comparison, beside, model, spread)]
     misfits = [comparison.misfit(row) for row in drawn]
     best = int(np.argmin(misfits)) if misfits else None
-    inside = bool(np.all(share <= TOLERATED)) and not flat
+    each_line = bool(np.all(share <= TOLERATED))
+    together = is_one_of(comparison, spread, [model, *drawn], 1.0 - confidence) if each_line else False
     worst = int(np.argmax(share))
     return Differences(
-        inside=inside,
+        inside=together and not flat,
+        each_line=each_line,
         misfit=before / count,
         off=max(float(share[worst]), 0.0),
         off_hz=float(comparison.f[worst]) if share[worst] > TOLERATED else None,

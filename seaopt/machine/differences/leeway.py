@@ -58,15 +58,24 @@ class Spread:
         if not kept:
             none = np.zeros(0)
             return Leeway(directions=slopes[kept], std=none, low=none, high=none)
-        left, spreads, axes = np.linalg.svd(self.beyond[:, kept], full_matrices=False)
-        felt = spreads > FELT * spreads[0]
-        along = (left * spreads)[:, felt]
+        axes, along = self.find_axes(kept)
         return Leeway(
-            directions=axes[felt] @ slopes[kept],
-            std=spreads[felt] / np.sqrt(len(along)),
+            directions=axes @ slopes[kept],
+            std=np.sqrt(np.mean(along**2, axis=0)),
             low=np.minimum(np.min(along, axis=0), 0.0),
             high=np.maximum(np.max(along, axis=0), 0.0),
         )
+
+    def find_axes(self, kept: Sequence[int]) -> tuple[Float[np.ndarray, "d k"], Float[np.ndarray, "j d"]]:
+        """Return the principal axes of some of the values, and where along them each draw is."""
+        left, spreads, axes = np.linalg.svd(self.beyond[:, kept], full_matrices=False)
+        felt = spreads > FELT * spreads[0]
+        return axes[felt], (left * spreads)[:, felt]
+
+    def move(self, beyond: Float[np.ndarray, " n"]) -> dict[str, float]:
+        """Return values so far beyond the nominal ones, in units of their spread."""
+        parts = zip(self.names, self.nominal, self.sizes, beyond.tolist(), strict=True)
+        return {name: at + size * far for name, at, size, far in parts}
 
 
 def take_spread(draws: Sequence[Mapping[str, float]], nominal: Mapping[str, float]) -> Spread:
