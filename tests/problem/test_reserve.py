@@ -13,9 +13,8 @@ from seaopt.control.laws.structures import Notch
 from seaopt.control.tuning.law_numbers import read_numbers
 from seaopt.control.tuning.tuner import make_task
 from seaopt.problem import certify_problem, tune_problem
-from seaopt.progress import ignore
 from seaopt.robustness import JointTuning
-from seaopt.robustness.certificate.retuning.reserve import Look, keep_reserve
+from seaopt.robustness.certificate.retuning.reserve import Look, describe_shortfall, keep_reserve
 from seaopt.robustness.certificate.simulated import SIMULATIONS
 from seaopt.robustness.uncertainty.worst import Witness, Worst
 from tests.checks import leave_out
@@ -120,7 +119,28 @@ def test_the_worst_of_some_rounds_is_not_kept():
             worst = Worst(stand, thor, witness, limited=True)
             return {"stand": Look(worst=worst, alone=0.8 * used if used > 1.2 else used)}
 
-        assert keep_reserve(tune, look, spec, ignore) is made[kept]
+        told = []
+        assert keep_reserve(tune, look, spec, lambda *what, told=told: told.append(what)) is made[kept]
+        assert len([what for what in told if len(what) == 1]) == (points_met[-1] and severities[kept] > 1.0)
+
+
+def test_what_a_schedule_misses_at_draws_is_told_with_its_place_and_what_would_do(stand, thor):
+    """Between the points another point may do; at one a lower bandwidth alone."""
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3)
+    schedule = tune_schedule(stand, thor, spec, "J", [2e-6, 4e-6])
+    figures = {"ms": 1.64, "mt": 1.365, "ms_hz": 40.0, "spectral_radius": 0.9, "severity": 1.05}
+    witness = Witness(parameters={"eta": 0.9}, **figures)
+    said = []
+    for value in (3e-6, 4e-6):
+        worst = Worst(stand, thor.update(J=value), witness, limited=True)
+        said.append(describe_shortfall(schedule, {"swing": Look(worst=worst, alone=1.0)}))
+    assert said[0] == (
+        "the schedule has Mt = 1.365, 5 % beyond max_complementary = 1.3, on swing at eta = 0.9, J = 3e-06; "
+        "add a point at J = 3e-06, or ask for a bandwidth_hz below 30"
+    )
+    assert "J = 4e-06; ask for a bandwidth_hz below 30" in said[1] and "add" not in said[1]
+    unstable = Worst(stand, thor, replace(witness, severity=1e6 + 1.01), limited=True)
+    assert "is unstable on" in describe_shortfall(schedule, {"swing": Look(worst=unstable, alone=1.0)})
 
 
 NOTCHED = {"notch": Notch(frequency_hz=60.0, width=0.3, depth=0.4), "prefilter": "second_order"}

@@ -34,6 +34,7 @@ from seaopt.robustness.uncertainty.worst import Worst, find_worst, measure_worst
 
 LOOKED_AT, LOOK_STREAM = 64, 0x100C  # draws of a look, and their seed, which no certificate has
 SEARCHES = 4  # of each plant, at values of a schedule
+MS, MT = "max_sensitivity", "max_complementary"
 ROUNDS = 3  # of looking and tuning again
 ROOM = 1e-3  # more than what was found asks, as the next law is another
 MOST_RESERVE = 0.15  # more of it is none: points are missing, or a term asks too much
@@ -115,31 +116,54 @@ def keep_reserve(
     make: Make, look: Callable[[ScheduledController], Mapping[str, Look]], spec: ControllerSpec, progress: Progress
 ) -> ScheduledController:
     """Return a schedule that keeps its limits at the draws that are looked at, too, tuned again until it does. Where
-    none does, it is the one that misses least, or one that misses limits at its points, which says what can be had.
-    `make` tunes with a specification, with further plants on which its limits are kept, near a schedule; `look` returns
-    the worst case of each plant.
+    none does, it is the one that misses least, and a remark says by how much and where; or one that misses limits at
+    its points, which says what can be had. `make` tunes with a specification, with further plants on which its limits
+    are kept, near a schedule; `look` returns the worst case of each plant.
     """
     witnesses: dict[str, tuple[Plant, ParameterSet]] = {}
     first, *again = divide(progress, *(1.0 for _ in range(1 + ROUNDS)))
     kept = schedule = make(spec, witnesses, None, first)
-    least = math.inf
+    least, left = math.inf, dict[str, Look]()
     for number, part in enumerate((*again, None), start=1):
         if not all(each.met for each in schedule.controllers):
             return schedule
         looks, broken = look(schedule), any(place.broken for place in schedule.between)
-        over = [each for each in looks.values() if each.is_over]
-        missed = max((each.worst.severity for each in over), default=0.0) + UNSTABLE * broken
+        over = {name: each for name, each in looks.items() if each.is_over}
+        missed = max((each.worst.severity for each in over.values()), default=0.0) + UNSTABLE * broken
         if missed >= least:
             break
-        kept, least, needed = schedule, missed, find_reserve(spec, over, BETWEEN if broken else 0.0)
+        kept, least, left = schedule, missed, over
+        needed = find_reserve(spec, over.values(), BETWEEN if broken else 0.0)
         if not missed or needed > MOST_RESERVE or part is None:
             break
         spec = replace(spec, reserve=needed)
         for name, each in looks.items():
             witnesses |= list_witnesses(name, number, each.worst)
         schedule = make(spec, witnesses, schedule, prefix(part, f"with worst cases, round {number}"))
+    if left:
+        progress(describe_shortfall(kept, left))
     progress("worst cases looked at", 1.0)
     return kept
+
+
+def describe_shortfall(schedule: ScheduledController, over: Mapping[str, Look]) -> str:
+    """Return one sentence: where a schedule breaks a limit most at draws, by how much, and what would do."""
+    name, look = max(over.items(), key=lambda pair: pair[1].worst.severity)
+    worst, variable = look.worst, schedule.over
+    value = worst[1][variable].value if variable in worst[1] else None
+    between = value is not None and value not in schedule.points
+    places = worst.parameters | ({} if value is None else {variable: value})
+    where = f"on {name} at {format_values(places, missing='nominal')}"
+    lower = f"a bandwidth_hz below {schedule.spec.bandwidth_hz if value is None else schedule.asked_hz(value):.3g}"
+    what = f"add a point at {variable} = {value:.4g}, or ask for {lower}" if between else f"ask for {lower}"
+    if worst.severity >= UNSTABLE:
+        return f"the schedule is unstable {where}; {what}"
+    shares = (
+        (figure / level, f"{symbol} = {figure:.4g}, {100.0 * (figure / level - 1.0):.2g} % beyond {key} = {level:g}")
+        for symbol, figure, key in (("Ms", worst.witness.ms, MS), ("Mt", worst.witness.mt, MT))
+        if (level := schedule.spec.level(key)) is not None
+    )
+    return f"the schedule has {max(shares)[1]}, {where}; {what}"
 
 
 def find_reserve(spec: ControllerSpec, over: Iterable[Look], least: float = 0.0) -> float:
