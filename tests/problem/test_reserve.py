@@ -85,6 +85,15 @@ def test_a_schedule_keeps_its_limits_at_the_draws_at_its_points_and_between(make
     assert any(name.startswith("stand, round 1: ") for name in tuned.others)
 
 
+def test_a_reserve_that_was_tried_is_not_advised(stand, thor):
+    for reserve, advised in ((0.0, True), (0.03, False)):
+        spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, reserve=reserve)
+        schedule = tune_schedule(stand, thor, spec, "J", [2e-6, 4e-6])
+        broken = replace(schedule.between[0], broken=("max_sensitivity",))
+        remedy = replace(schedule, between=(broken,)).remedy
+        assert "points = [2e-06, 3e-06, 4e-06]" in remedy and ("reserve = 0.03" in remedy) == advised
+
+
 @pytest.mark.slow
 def test_a_schedule_that_cannot_keep_them_says_what_it_can(make):
     problem = make(SCHEDULE, std=60000, ms=1.3)
