@@ -9,9 +9,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import field, fields, replace
 from typing import Any
 
+import numpy as np
+
 from seaopt.bench import Sensors
 from seaopt.codec import from_content, join_schemas
-from seaopt.control import Controller, ScheduledController
+from seaopt.control import Controller, LoopFigures, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.running.fed_back import close_whole, feeds_back, split_states
 from seaopt.errors import FileError, SeaoptError
@@ -30,7 +32,6 @@ from seaopt.robustness.certificate.compensation import (
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import MarginDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
-from seaopt.robustness.certificate.limits import WITH_TERMS
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement
 from seaopt.robustness.certificate.scheduled import take_worst
 from seaopt.robustness.certificate.simulated import Simulated, find_port_figures
@@ -47,6 +48,7 @@ from seaopt.robustness.verification.schedule_sweep import Sweep
 from seaopt.robustness.verification.verification import Verification, make_stages
 
 FILE, CERTIFY_AGAIN = "robustness.json", "certify again"
+SAME_FIGURES = 1e-3  # of Ms and Mt, below which the loop that a file is of is the one that is closed today
 
 
 @record
@@ -219,17 +221,16 @@ def _build_one(
             raise FileError(f'{FILE}: plants has "{name}", which is not a plant given; {CERTIFY_AGAIN}')
     impedance = stored.impedance or StoredImpedance()
     linear = {name: plants[name] for name in stored.plants}
-    if WITH_TERMS not in stored.remarks and any(feeds_back(controller, plant) for plant in linear.values()):
-        raise FileError(
-            f"{FILE}: is of an older seaopt, whose figures leave out what the law's compensation or outer loop feeds "
-            f"back; {CERTIFY_AGAIN}"
-        )
     try:
+        figures = {name: close_whole(controller, plant, parameters).figures() for name, plant in linear.items()}
+        for name, plant in linear.items():
+            if feeds_back(controller, plant):
+                _check_current(name, content["plants"][name], figures[name])
         worst = {name: content["plants"][name]["worst"] for name in linear}
         certificate = Certificate(
             requirements=read_requirements(content),
             place=place,
-            plants={name: close_whole(controller, plant, parameters).figures() for name, plant in linear.items()},
+            plants=figures,
             margins={
                 name: plant_margins(controller, plant, parameters)
                 for name, plant in linear.items()
@@ -263,6 +264,17 @@ def _build_one(
         raise
     except SeaoptError as error:
         raise FileError(f"{FILE}: {error}; {CERTIFY_AGAIN}") from error
+
+
+def _check_current(name: str, written: Mapping[str, Any], figures: LoopFigures) -> None:
+    """Refuse a plant whose Ms or Mt in a file is of another loop than that with what the law feeds back besides."""
+    for key in ("ms", "mt"):
+        value, found = written.get(key), getattr(figures, key)
+        if not np.isclose(np.inf if value is None else value, found, rtol=SAME_FIGURES, atol=0.0):
+            raise FileError(
+                f"{FILE}: {key} of {name} is {value}, and {found:.4g} with what the law's compensation and outer loop "
+                f"feed back: it is of an older seaopt, or of another law; {CERTIFY_AGAIN}"
+            )
 
 
 def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: Mapping[str, Any]) -> Certificate:

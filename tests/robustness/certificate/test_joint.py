@@ -124,6 +124,14 @@ def test_too_few_rounds_are_no_certificate(stand, swing, thor):
     assert "1 rounds were too few" in done.explanation
 
 
+def test_a_reserve_that_was_asked_is_kept_in_every_round(stand, swing, thor):
+    """One of 16 % is more than any that is given unasked, and worst cases go back to the tuner all the same."""
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, reserve=0.16)
+    done = tune_certified(stand, thor, spec, {"swing": swing}, ranges={"I_p": (0.15, 0.6)}, samples=60)
+    assert done.status == "certified" and done.rounds[0].added
+    assert [each.controller.spec.reserve for each in done.rounds] == [0.16] * len(done.rounds)
+
+
 def test_bad_input(stand, swing, thor):
     with pytest.raises(ControlError, match="rounds = 0"):
         tune_certified(stand, thor, SPEC, {"swing": swing}, rounds=0)

@@ -11,7 +11,7 @@ import seaopt as so
 from seaopt.control import CompensateGravity, add_compensation
 from seaopt.errors import FileError
 from seaopt.files import seal
-from seaopt.robustness.certificate.limits import WITH_TERMS, describe_log
+from seaopt.robustness.certificate.limits import describe_log
 from seaopt.robustness.certificate.simulated import STEPS
 from seaopt.robustness.uncertainty.logs import LogVerdict
 from tests.checks import leave_out
@@ -44,11 +44,12 @@ def test_files_without_what_a_law_feeds_back_or_of_another_kind_are_refused(monk
     law = add_compensation(plain, gravity=CompensateGravity(fraction=0.9), link=(knee, values))
     content = so.certify(law, {"knee": knee}, values, samples=2, simulations=False).to_dict()
     assert so.Certificate.from_dict(content, law, {"knee": knee}, values).plants
-    older = content | {"remarks": [text for text in content["remarks"] if text != WITH_TERMS]}
-    with pytest.raises(
-        FileError, match=r"leave out what the law's compensation or outer loop feeds back; certify again"
-    ):
+    without = so.certify(plain, {"knee": knee}, values, samples=2, simulations=False).to_dict()["plants"]["knee"]
+    older = content | {"plants": {"knee": content["plants"]["knee"] | {key: without[key] for key in ("ms", "mt")}}}
+    with pytest.raises(FileError, match=r"feed back: it is of an older seaopt, or of another law; certify again"):
         so.Certificate.from_dict(seal(older), law, {"knee": knee}, values)
+    reworded = seal(content | {"remarks": ["figures are of the loop that is exported"]})
+    assert so.Certificate.from_dict(reworded, law, {"knee": knee}, values).plants
     scheduled = seal(content | {"schedule": {"over": "m"}})
     with pytest.raises(FileError, match=r"is of a schedule, and law is one law; give the law that it is of"):
         so.Certificate.from_dict(scheduled, law, {"knee": knee}, values)

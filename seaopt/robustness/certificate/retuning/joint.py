@@ -36,7 +36,7 @@ from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
 from seaopt.robustness.certificate.retuning.relief import Relief, find_relief
-from seaopt.robustness.certificate.retuning.reserve import MOST_RESERVE, Look, find_reserve, look_at_draws
+from seaopt.robustness.certificate.retuning.reserve import MOST_RESERVE, Look, look_at_draws, raise_reserve
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import place_values
@@ -79,8 +79,9 @@ class JointTuning(Result):
     ----------
     status : str
         "certified"; "infeasible": the limits cannot be met on the witnesses together; "stuck": the certificate fails
-        on plants where the tuner met its limits, or on a requirement that it does not treat; "rounds": there were too
-        few.
+        on plants where the tuner met its limits, or on a requirement that it does not treat; "terms": what the law
+        feeds back besides uses so much more of a limit than the law alone that no reserve makes room; "rounds": there
+        were too few.
     controller : Controller or ScheduledController
         Of the last round.
     certificate : Certificate or None
@@ -92,7 +93,7 @@ class JointTuning(Result):
         Of one law that breaks its limits with what it compensates: what would do.
     """
 
-    status: Literal["certified", "infeasible", "stuck", "rounds"]
+    status: Literal["certified", "infeasible", "stuck", "terms", "rounds"]
     controller: Controller | ScheduledController
     certificate: Certificate | None
     rounds: tuple[Round, ...]
@@ -120,6 +121,10 @@ class JointTuning(Result):
         if self.status == "rounds":
             more = "" if self.certificate.fails_by_weight else "; give more rounds, or a larger reserve"
             return f"{len(self.rounds)} rounds were too few: {broken}{more}"
+        if self.status == "terms":
+            more = "what is compensated, or the outer loop, takes more of a limit than a reserve of"
+            remedy = "" if self.relief else "compensate less, or ask for a softer impedance"
+            return f"{more} {100.0 * MOST_RESERVE:g} % makes room for: {replace(broken, remedy=remedy)}"
         return f"no witness is left that the tuner has not met: {broken}"
 
     @property
@@ -248,18 +253,20 @@ def tune_certified(
         added = _list_new_witnesses(certificate, [(plant, values), *pairs], number)
         plants_met = 1 + len(witnesses)
         made: dict[str, Any] = {"controller": controller, "certificate": certificate}
-        needed = find_reserve(spec, [] if certificate is None or certificate.passed else _list_over(certificate))
+        raised = raise_reserve(spec, [] if certificate is None or certificate.passed else _list_over(certificate))
         finished.append(Round(number=number, plants=plants_met, added=(*added,), **made))
         if certificate is None:
             status = "infeasible"
         elif certificate.passed:
             status = "certified"
-        elif not added or needed > MOST_RESERVE:
+        elif raised is None:
+            status = "terms"
+        elif not added:
             status = "stuck"
         elif number == rounds:
             status = "rounds"
         else:
-            witnesses, spec = witnesses | added, replace(spec, reserve=needed)
+            witnesses, spec = witnesses | added, raised
             continue
         relief = None
         if status != "certified" and over is None:

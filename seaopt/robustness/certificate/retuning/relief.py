@@ -2,7 +2,7 @@
 
 Three answers are looked for, each as a law whose draws are looked at: the largest share of what is compensated, and
 that of an impedance's stiffness and damping, with which the same law keeps its limits, by bisection; and a lower
-bandwidth at which a law that is tuned anew does.
+bandwidth at which a law that is tuned anew does. Shares are whole percents, and bandwidths are as they are said.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from dataclasses import replace
 from seaopt.control import Controller
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.errors import SeaoptError
+from seaopt.formatting import join_words
 from seaopt.records import record
 from seaopt.robustness.certificate.retuning.reserve import Look
 
-HALVINGS = 6
 SLOWER = (0.8, 0.65, 0.5, 0.35)  # of the bandwidth asked
 
 
@@ -24,17 +25,21 @@ SLOWER = (0.8, 0.65, 0.5, 0.35)  # of the bandwidth asked
 class Relief:
     """What would do in place of a law as it was asked for."""
 
-    compensated: float  # share of what is compensated, for the same law; 0 where less does not help, or nothing is
-    rendered: float  # the same of the impedance's stiffness and damping
+    compensated: float | None  # share of what is compensated, for the same law; 0 where less does not help
+    rendered: float | None  # the same of the impedance's stiffness and damping; None where there is none
     bandwidth_hz: float | None  # with all of both; None where none of those tried does
+    tried_hz: tuple[float, ...]  # lower bandwidths, tried in this order until one does
 
     def __str__(self) -> str:
-        less = f"{100.0 * self.compensated:.2g} % of what is compensated" if self.compensated else ""
-        softer = f"{100.0 * self.rendered:.2g} % of the impedance's stiffness and damping" if self.rendered else ""
-        slower = "" if self.bandwidth_hz is None else f"a bandwidth of {self.bandwidth_hz:.3g} Hz"
-        answers = ", or with ".join(filter(None, (less, softer, slower)))
-        tried = "less compensation, a softer impedance or a lower bandwidth alone does not keep the limits at draws"
-        return f"draws keep the limits with {answers}" if answers else tried
+        less = f"{100.0 * self.compensated:.0f} % of what is compensated" if self.compensated else ""
+        softer = f"{100.0 * self.rendered:.0f} % of the impedance's stiffness and damping" if self.rendered else ""
+        slower = "" if self.bandwidth_hz is None else f"a bandwidth of {self.bandwidth_hz:g} Hz"
+        if answers := [each for each in (less, softer, slower) if each]:
+            return f"draws keep the limits with {', or with '.join(answers)}"
+        tried = ["less compensation"] if self.compensated is not None else []
+        tried += ["a softer impedance"] if self.rendered is not None else []
+        tried += [f"a bandwidth of {join_words([f'{band:g}' for band in self.tried_hz])} Hz"] if self.tried_hz else []
+        return f"draws do not keep the limits with {', or with '.join(tried)} alone"
 
 
 def find_relief(
@@ -44,22 +49,29 @@ def find_relief(
     bandwidth in Hz, `look` looks at the draws of one.
     """
 
-    def keeps(tried: Controller) -> bool:
-        return tried.met and not any(each.is_over for each in look(tried).values())
+    def keeps(make: Callable[[float], Controller], at: float) -> bool:
+        try:
+            tried = make(at)
+            return tried.met and not any(each.is_over for each in look(tried).values())
+        except SeaoptError:  # there is no such law: of a damping that is critical at a lower bandwidth, say
+            return False
 
     def bisect(shrink: Callable[[float], Controller]) -> float:
-        low, high = 0.0, 1.0
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if keeps(shrink(middle)) else (low, middle)
-        return low
+        low, high = 0, 100
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if keeps(shrink, middle / 100.0) else (low, middle)
+        return low / 100.0
 
-    terms, outer, asked = law.compensation, law.outer, law.spec.bandwidth_hz
-    lower = (share * asked for share in SLOWER if share * asked >= law.spec.bandwidth_range_hz[0])
+    terms, outer, least = law.compensation, law.outer, law.spec.bandwidth_range_hz[0]
+    lower = [float(f"{share * law.spec.bandwidth_hz:.3g}") for share in SLOWER]
+    lower = [band for band in lower if band >= least]
+    compensates = terms is not None and (terms.friction is not None or terms.gravity is not None)
     return Relief(
-        compensated=0.0 if terms is None else bisect(lambda share: replace(law, compensation=_scale(terms, share))),
-        rendered=0.0 if outer is None else bisect(lambda share: replace(law, outer=_soften(outer, share))),
-        bandwidth_hz=next((band for band in lower if keeps(tune_at(band))), None),
+        compensated=bisect(lambda share: replace(law, compensation=_scale(terms, share))) if compensates else None,
+        rendered=None if outer is None else bisect(lambda share: replace(law, outer=_soften(outer, share))),
+        bandwidth_hz=next((band for band in lower if keeps(tune_at, band)), None),
+        tried_hz=(*lower,),
     )
 
 

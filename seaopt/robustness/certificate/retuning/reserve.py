@@ -37,7 +37,7 @@ SEARCHES = 4  # of each plant, at values of a schedule
 MS, MT = "max_sensitivity", "max_complementary"
 ROUNDS = 3  # of looking and tuning again
 ROOM = 1e-3  # more than what was found asks, as the next law is another
-MOST_RESERVE = 0.15  # more of it is none: points are missing, or a term asks too much
+MOST_RESERVE = 0.15  # that is given unasked: what needs more lacks points, or a term asks too much
 NEAR = 0.98  # of the limits: what uses less is no witness
 BETWEEN = 0.03  # of a schedule that breaks a limit between its points at the nominal parameters already
 Witnesses = Mapping[str, tuple[Plant, ParameterSet]]
@@ -133,10 +133,10 @@ def keep_reserve(
         if missed >= least:
             break
         kept, least, left = schedule, missed, over
-        needed = find_reserve(spec, over.values(), BETWEEN if broken else 0.0)
-        if not missed or needed > MOST_RESERVE or part is None:
+        raised = raise_reserve(spec, over.values(), BETWEEN if broken else 0.0)
+        if not missed or raised is None or part is None:
             break
-        spec = replace(spec, reserve=needed)
+        spec = raised
         for name, each in looks.items():
             witnesses |= list_witnesses(name, number, each.worst)
         schedule = make(spec, witnesses, schedule, prefix(part, f"with worst cases, round {number}"))
@@ -166,9 +166,12 @@ def describe_shortfall(schedule: ScheduledController, over: Mapping[str, Look]) 
     return f"the schedule has {max(shares)[1]}, {where}; {what}"
 
 
-def find_reserve(spec: ControllerSpec, over: Iterable[Look], least: float = 0.0) -> float:
-    """Return the reserve of a specification, or more where what is over a limit needs more than the law alone."""
-    return max(spec.reserve, least, *(each.needed for each in over))
+def raise_reserve(spec: ControllerSpec, over: Iterable[Look], least: float = 0.0) -> ControllerSpec | None:
+    """Return a specification with the reserve that what is over a limit needs, no less than it has; None where that is
+    more than it has and more than `MOST_RESERVE`.
+    """
+    needed = max(spec.reserve, least, *(each.needed for each in over))
+    return replace(spec, reserve=needed) if needed <= max(spec.reserve, MOST_RESERVE) else None
 
 
 def list_witnesses(name: str, number: int, worst: Worst) -> Witnesses:
