@@ -175,6 +175,8 @@ def _say_refuted(row: Judged) -> str:
 def _say_undecided(response: Response) -> str:
     """Return of which limits a log does not say enough, and what to record so that it does."""
     rows = [row for row in response.judged if row.limit is not None and row.outcome == "undecided"]
+    near = [_say_near(row) for row in rows if row.near is not None]
+    rows = [row for row in rows if row.near is None]
     record: list[str] = []
     if response.needs_phases:
         record.append(f"{LEAST_PHASES} sets of random phases, which dry friction asks for")
@@ -186,7 +188,18 @@ def _say_undecided(response: Response) -> str:
     if periods := max((row.periods or 0 for row in rows), default=0):
         record.append(f"{periods} periods in all")
     wanted = join_words(record) or "more periods, or a larger reference"
-    return f"{join_words([row.name for row in rows])}: record {wanted}"
+    others = [f"{join_words([row.name for row in rows])}: record {wanted}"] if rows else []
+    return "; ".join([*others, *near])
+
+
+def _say_near(row: Judged) -> str:
+    """Return that a figure lies at its limit."""
+    unit, value = unit_after(row.unit), format_number(row.value, 4)
+    return (
+        f"{row.name}: the estimate, {value}{unit}, is within {format_number(100.0 * (row.near or 0.0), 2)} % of the "
+        f"limit as judged, {format_number(row.limit, 4)}{unit}, so that no record of sensible length decides (over an "
+        "hour); play a larger reference, or ask for less or tune for more of it"
+    )
 
 
 def _show_interval(row: Judged) -> str:

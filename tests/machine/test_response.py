@@ -234,3 +234,16 @@ def test_margins_of_a_loop_that_crosses_a_gain_of_one_three_times(controller):
         assert gain != 9.0 or np.isclose(rows["phase margin"], 61.68, atol=0.05)  # the others are -125 and 64 degrees
         assert rows.keys() == truth.keys()
         assert all(np.isclose(rows[name], truth[name], rtol=1e-2) for name in rows), (rows, truth)
+
+
+@pytest.mark.parametrize(("beyond", "near"), [(3e-4, True), (-3e-4, True), (0.02, False)])
+def test_a_figure_at_its_limit_is_said_to_be_so_in_place_of_hours_to_record(controller, bench, beyond, near):
+    log = bench.log(Machine(), REFERENCE, noise=6.0)
+    value = next(row.value for row in so.accept(controller, [log]).response.judged if row.name == "Ms")
+    asked = replace(controller, spec=replace(controller.spec, max_sensitivity=value * (1.0 + beyond) / 1.05))
+    result = so.accept(asked, [log])
+    (ms,) = (row for row in result.response.judged if row.name == "Ms")
+    words = " ".join(str(result).split())
+    assert ms.outcome == "undecided" and ("no record of sensible length" in words) == near, ms
+    assert f"{ms.periods} periods in all" not in words if near else ms.near is None
+    assert not near or np.isclose(ms.near, abs(beyond), rtol=0.01)

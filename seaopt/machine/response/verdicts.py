@@ -45,7 +45,8 @@ CENTRE = 1.0 - 1e-9  # a risk at which discs are points
 REACH = 0.25, 2.0  # of the crossover: lines go from below the first to above the second
 CLOSEST = 1.5  # ratio of neighbouring lines, at most, from half the crossover on
 FEWEST_LINES = 8
-MOST_PERIODS = 1e6  # that are asked for
+MOST_PERIODS = 1e6  # that are counted
+HOUR = 3600.0  # s: a record that is longer is not asked for
 NYQUIST = 0.8  # of half the sample rate, above which no line has to lie
 ON_GRID = 0.05  # relative, by which the outermost lines may miss, which lie on multiples of the period's
 
@@ -144,6 +145,8 @@ def judge_response(controller: Controller, groups: Sequence[Blocks], confidence:
     if needs_lines:  # a line that breaks a limit does so whatever lies beside it; turns are counted from line to line
         open_ = [row.outcome == "confirmed" or row.name == "stability" for row in rows]
         rows = [_leave_open(row) if each else row for row, each in zip(rows, open_, strict=True)]
+    longest_s = max(group.period_s for group in groups)
+    rows = [_tell_near(row, longest_s) for row in rows]
     limited = [row for row in rows if row.limit is not None]
     return Response(
         met=all(row.outcome == "confirmed" for row in limited),
@@ -174,6 +177,13 @@ def _covers(measured: Sequence[Measured], low: float, high: float) -> bool:
 
 def _leave_open(row: Judged) -> Judged:
     return replace(row, outcome="undecided", periods=None)
+
+
+def _tell_near(row: Judged, period_s: float) -> Judged:
+    """Return a row with how near its estimate is to the limit, where it is so near that no hour would decide."""
+    if row.periods is None or row.periods * period_s <= HOUR or row.value is None or not row.limit:
+        return row
+    return replace(row, near=abs(row.value / row.limit - 1.0))
 
 
 def _is_same_gain(measured: Sequence[Measured]) -> bool:
@@ -257,8 +267,10 @@ def _judge_sensitivity(asked: float | None, measured: Sequence[Measured], alpha:
 
 
 def _count_periods(outcome: Outcome, needed: float) -> int | None:
-    """Return how many periods would decide; None where it is decided, or no number would."""
-    return math.ceil(needed) if outcome == "undecided" and 0.0 < needed < MOST_PERIODS else None
+    """Return how many periods would decide, or the most that are counted; None where it is decided, or no number
+    would.
+    """
+    return math.ceil(min(needed, MOST_PERIODS)) if outcome == "undecided" and needed > 0.0 else None
 
 
 def _decide(confirmed: bool, refuted: bool) -> Outcome:
