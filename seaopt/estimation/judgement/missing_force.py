@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from seaopt.estimation.problem.experiment import FEWEST_READ
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.parameters import ParameterSet
@@ -28,7 +29,7 @@ from seaopt.simulation.simulate import input_samples
 
 @record(eq=False)
 class MissingForce:
-    """The force at each sample, with the motor's position, by the name of its state, and speed."""
+    """The force at each sample of which all is measured, with the motor's position, by its state's name, and speed."""
 
     state: str
     position: Float[np.ndarray, " n"]
@@ -42,12 +43,13 @@ def find_missing_force(experiment: FitExperiment, params: ParameterSet, rows: sl
     """
     data, plant, period = experiment.data, experiment.data.plant, experiment.period
     state = plant.sensing.motor_position if plant.sensing is not None else None
-    rates, measured = _pair_rates(plant), [name for name in plant.states if name in data.log.signals]
+    channels = {name: data.log[name][rows] for name in plant.states if name in data.log.signals}
+    rates, measured = _pair_rates(plant), [name for name, values in channels.items() if np.any(np.isfinite(values))]
     if state not in measured or state not in rates:
         return None
     x = {name: data.read(name)[rows] for name in measured}
     x |= {rates[name]: np.gradient(x[name], period) for name in measured if name in rates and rates[name] not in x}
-    if x.keys() != plant.states.keys() or not np.ptp(x[state]):
+    if x.keys() != plant.states.keys():
         return None
     moving = list(plant.states).index(rates[state])
     time = data.log.time[rows]
@@ -59,10 +61,20 @@ def find_missing_force(experiment: FitExperiment, params: ParameterSet, rows: sl
     acceleration = np.gradient(x[rates[state]], period)
     acceleration[1:-1] = np.diff(x[state], 2) / period**2
     force = (np.array(pushed)[moving] - acceleration) / float(effect[moving, 0])
-    others = np.column_stack([np.ones(time.size), np.sign(x[rates[state]]), states.T, u.T])
+    there = _find_whole(np.stack([channels[name] for name in measured]))
+    if np.count_nonzero(there) < FEWEST_READ:
+        return None
+    position, speed, force = x[state][there], x[rates[state]][there], force[there]
+    others = np.column_stack([np.ones(force.size), np.sign(speed), states.T[there], u.T[there]])
     others /= np.maximum(np.max(np.abs(others), axis=0), 1e-300)
     force -= others @ np.linalg.lstsq(others, force, rcond=1e-9)[0]
-    return MissingForce(state=state, position=x[state], speed=x[rates[state]], force=force)
+    return MissingForce(state=state, position=position, speed=speed, force=force) if np.ptp(position) else None
+
+
+def _find_whole(values: Float[np.ndarray, "states n"]) -> Bool[np.ndarray, " n"]:
+    """Return the samples at which all are measured, and their neighbours, of which differences are."""
+    missing = ~np.all(np.isfinite(values), axis=0)
+    return ~(missing | np.append(missing[1:], False) | np.append(False, missing[:-1]))
 
 
 @memo

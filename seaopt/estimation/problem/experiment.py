@@ -31,10 +31,8 @@ EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
-FEWEST_READ, ROUGH = (
-    16,
-    0.3,
-)  # samples that tell a reading's noise, and how much of it, rad of a wave, takes 4 % of that
+FEWEST_READ = 16  # samples that tell a reading's noise
+ROUGH = 0.3  # rad of a wave, that takes 4 % of it
 Mask = Literal["auto", "declared", "none"]
 # The values of a setting, and how to name them.
 CHOICES = {

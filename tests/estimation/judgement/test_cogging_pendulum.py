@@ -136,3 +136,35 @@ def test_a_fit_that_went_through_a_pickle_follows_as_before():
         assert fits[1].parameters[name].value == pytest.approx(fits[0].parameters[name].value, rel=1e-9), name
     shown = fits[0].predict(experiment)
     assert np.std(shown.model["theta_m"] - shown.measured["theta_m"]) < 0.01 * np.std(shown.measured["theta_m"])
+
+
+def _hide(log, name, rows):
+    """Return a log in which some samples of a channel are missing."""
+    columns = {each: log[each].copy() for each in log.signals}
+    columns[name][rows] = np.nan
+    return so.Log.from_arrays(time=log.time, **columns)
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [slice(1000, 1400), np.random.default_rng(0).random(3200) < 0.05],
+    ids=["a second", "one sample of twenty"],
+)
+def test_samples_that_the_position_misses_do_not_hide_the_waves(hidden):
+    """Over a second the motor turns by tens of waves, which a line between its ends does not have."""
+    experiment, params = pose(_hide(record(), "theta_m", hidden))
+    best = so.fit([experiment], params).hypotheses[0]
+    assert (best.parts, best.outcome) == (("cogging",), "adopted")
+    assert best.frees["n_g"] == pytest.approx(COGS["n_g"], rel=1e-4)
+    for name in ("J_m", "b_r", "f_c", "k_s"):
+        assert best.parameters[name] == pytest.approx(TRUTH[name], rel=0.01), name
+
+
+@pytest.mark.parametrize("channel", ["theta_m", "theta_l"])
+def test_a_channel_without_a_sample_and_a_short_log_have_no_missing_force(channel):
+    log = _hide(record(), channel, slice(None))
+    whole, params = pose(record())
+    experiment = replace(whole, log=log, outputs=tuple({"theta_m", "theta_l"} - {channel}))
+    for each, rows in ((experiment, slice(0, len(log))), (whole, slice(0, 15))):
+        problem = pose_problem((each,), params, loss=Squares())
+        assert not find_followed_ripple(problem.experiments[0], params, rows, problem.unknowns.start)
