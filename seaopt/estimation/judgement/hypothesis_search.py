@@ -14,8 +14,10 @@ What this may cost is counted in evaluations of the problem, so that the same lo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import wraps
+from typing import ParamSpec
 
 import numpy as np
 
@@ -52,6 +54,8 @@ BACK = 1e-3  # of a residual's power, beyond the least yet, from which a refit i
 SLIGHT = 0.2  # of that: a step that may gain half as much ends a round
 NEAR = 1e-2  # squared standard deviations that may be left to the minimum
 LEFT = 1.0  # of them, from which a refit says only that something is missing, and not how far it moves the values
+
+P = ParamSpec("P")
 
 
 @record(eq=False)
@@ -202,10 +206,7 @@ class _Search:
         for hypothesis in pair.change.hypotheses if len(pair.change.hypotheses) > 1 else ():
             change = change_plants(hypothesis, self.fit.experiments, self.fit.parameters, self.sizes)
             assert change is not None  # it is in a pair
-            problem = _pose(change, pair.problem)
-            start = problem.evaluate(problem.unknowns.start_from(pair.values))
-            end = count_evaluations() + ROUNDS * ROUND  # whatever is left of the budget: a pair is not believed without
-            refit = _descend(change, problem, start, self.base, self.base, self.helps, end)
+            refit = _refit_alone(change, pair, self.helps, self.base)
             if refit is not None:
                 yield refit
 
@@ -230,10 +231,7 @@ class _Search:
             if change is None:
                 continue
             self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
-            try:
-                refit = _refit(change, problem, fitted, self.helps, self.base, self.end)
-            except SeaoptError:  # what does not make a problem explains nothing
-                continue
+            refit = _refit(change, problem, fitted, self.helps, self.base, self.end)
             if refit is not None:
                 yield refit
 
@@ -251,6 +249,20 @@ def _take_values(refit: Refit) -> ParameterSet:
     return refit.problem.params.update(**{name: refit.values[name] for name in refit.problem.shared_names})
 
 
+def _or_none(refit: Callable[P, Refit | None]) -> Callable[P, Refit | None]:
+    """Return a refit that is None where it is refused: what does not make a problem explains nothing."""
+
+    @wraps(refit)
+    def tried(*args: P.args, **kwargs: P.kwargs) -> Refit | None:
+        try:
+            return refit(*args, **kwargs)
+        except SeaoptError:
+            return None
+
+    return tried
+
+
+@_or_none
 def _refit(
     change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, end: int
 ) -> Refit | None:
@@ -262,10 +274,18 @@ def _refit(
     before = count_evaluations()
     problem = _pose(change, old)
     problem, start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
-    if not np.isfinite(start.cost):
-        return None
     refit = _descend(change, _rest(problem, start, old), start, fitted, base, helps, end)
     return refit and replace(refit, evaluations=count_evaluations() - before)
+
+
+@_or_none
+def _refit_alone(change: Change, pair: Refit, helps: float, base: Evaluation) -> Refit | None:
+    """Return the minimum with one part of a pair, from the pair's values, as `_refit` does; whatever is left of the
+    budget, for a pair is not believed without.
+    """
+    problem = _pose(change, pair.problem)
+    start = problem.evaluate(problem.unknowns.start_from(pair.values))
+    return _descend(change, problem, start, base, base, helps, count_evaluations() + ROUNDS * ROUND)
 
 
 def _pose(change: Change, old: FitProblem) -> FitProblem:
@@ -276,6 +296,7 @@ def _pose(change: Change, old: FitProblem) -> FitProblem:
     return problem
 
 
+@_or_none
 def _descend(
     change: Change,
     problem: FitProblem,
@@ -286,6 +307,8 @@ def _descend(
     end: int,
 ) -> Refit | None:
     """Return the minimum that rounds of iterations come to from a start, as `_refit` does."""
+    if not np.isfinite(start.cost):
+        return None
     before = count_evaluations()
     evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
     at_fit = least = checked = _measure_powers(fitted)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.errors import EstimationError
 from seaopt.estimation.judgement import hypothesis_search
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES
 from seaopt.estimation.judgement.hypothesis_search import ASKS, NEARLY, REMOVED, Refit, find_partial
@@ -328,6 +330,33 @@ def test_a_refit_that_was_left_on_its_way_goes_on(monkeypatch):
     (trial,) = search_breakaway(monkeypatch, look)
     assert trial.excess < ASKS and trial.outcome == "adopted"
     assert trial.frees["f_s"] == pytest.approx(0.032, rel=0.02)
+
+
+def test_a_refit_that_is_refused_or_has_no_start_is_left_out(monkeypatch):
+    """What goes on from another refit is guarded as a first one is: a search ends in no error and on finite costs."""
+
+    def refuse(*args, **kwargs):
+        raise EstimationError("refused")
+
+    def look(search, refit, join):
+        first = refit("stribeck")
+        pair = join(first, "droop")
+        far = replace(first, evaluation=replace(first.evaluation, cost=math.nan))
+        with monkeypatch.context() as soon:
+            soon.setattr(Refit, "at_minimum", False)
+            assert search.go_on(far) is far
+            soon.setattr(hypothesis_search, "minimise", refuse)
+            assert search.go_on(first) is first
+            soon.setattr(hypothesis_search, "pose_problem", refuse)
+            assert list(search.try_alone(pair)) == []
+        with monkeypatch.context() as soon:
+            start = replace(pair.problem.evaluate(pair.evaluation.z), cost=math.inf)
+            soon.setattr(type(pair.problem), "evaluate", lambda problem, z: start)
+            assert list(search.try_alone(pair)) == []
+        return [first]
+
+    (trial,) = search_breakaway(monkeypatch, look)
+    assert trial.outcome == "adopted"
 
 
 def test_none_is_named_while_the_excess_stays_high():
