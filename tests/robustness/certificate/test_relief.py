@@ -92,14 +92,16 @@ def test_what_helps_is_said_and_what_does_not_where_it_was_tried():
     assert both == "draws keep the limits with 62 % of what is compensated, or with a bandwidth of 12 Hz"
 
 
-def test_terms_that_need_more_than_a_reserve_can_give_are_named(look):
-    """Of an impedance with a quarter of the damping, around which the force law's Ms is 1.8 times its limit."""
+def tune_loosely_damped(around, **options):
     spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6)
+    options |= {"samples": 20, "rounds": 2, "complete": lambda law: add_impedance(law, KNEE, VALUES, around)}
+    return tune_certified(HELD, VALUES, spec, {"knee": KNEE}, **options)
+
+
+def test_terms_that_need_more_than_a_reserve_can_give_are_named():
+    """Of an impedance with a quarter of the damping, around which the force law's Ms is 1.8 times its limit."""
     around = replace(ASKED, damping=1.0)
-    done = tune_certified(
-        HELD, VALUES, spec, {"knee": KNEE}, ranges={"m": MASSES}, samples=20, rounds=2,
-        complete=lambda law: add_impedance(law, KNEE, VALUES, around),
-    )  # fmt: skip
+    done = tune_loosely_damped(around, ranges={"m": MASSES})
     assert done.status == "terms" and len(done.rounds) == 1 and done.rounds[0].added
     assert done.explanation.startswith(
         "what is compensated, or the outer loop, takes more of a limit than a reserve of"
@@ -113,6 +115,13 @@ def test_terms_that_need_more_than_a_reserve_can_give_are_named(look):
         use_limits(close_by_hand(done.controller, share=0.0, m=mass, **own)) for own in ({"around": around}, {})
     )
     assert worst.severity == pytest.approx(used, rel=1e-3) and 1.0 - alone / used > 0.15
+
+
+def test_without_draws_no_share_is_advised():
+    """Nothing is looked at where nothing is uncertain, and whatever is tried seems to keep its limits there."""
+    done = tune_loosely_damped(replace(ASKED, damping=1.0))
+    assert done.status == "terms" and not done.certificate.varied and done.relief is None
+    assert "compensate less, or ask for a softer impedance" in done.explanation and "robust_to" not in done.explanation
 
 
 @pytest.mark.parametrize(

@@ -301,10 +301,12 @@ def _list_over(certificate: Certificate) -> list[Look]:
 def _find_relief(
     rounds: Sequence[Round], tune_at: Callable[[float], Controller], look: Callable[[Controller], Mapping[str, Look]]
 ) -> Relief | None:
-    """Return what would do in place of the first law that what it feeds back besides takes beyond a limit."""
+    """Return what would do in place of the first law that what it feeds back besides takes beyond a limit; None where
+    nothing is uncertain, of which no draws can be looked at.
+    """
     for each in rounds:
         law, certificate = each.controller, each.certificate
-        beyond = [] if certificate is None else _list_over(certificate)
+        beyond = [] if certificate is None or not certificate.varied else _list_over(certificate)
         if isinstance(law, Controller) and any(case.needed for case in beyond):
             return find_relief(law, tune_at, look)
     return None
