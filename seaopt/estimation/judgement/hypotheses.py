@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.ripple_search import find_followed_ripple, find_ripple, move_zero
-from seaopt.estimation.problem.experiment import Experiment, find_finest
+from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.formatting import join_words
@@ -281,13 +281,13 @@ def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment)
     if position and position in plant.states and len(left.segments) == len(experiment.log.segments):
         minimum = fit.require_minimum("_measure")
         posed = next(e for e in minimum.problem.experiments if e.name == experiment.name)
-        read = position in log.signals
+        read = experiment.reads(position)
         if plant.moves and read:
             ripple = find_followed_ripple(posed, fit.parameters, longest, minimum.z)
         if not ripple:
             place = experiment.read(position)[longest] if read else run[position]
             ripple = find_ripple(posed, left, fit.parameters, place, number)
-            if not (plant.moves and ripple and ripple["n_g"] <= find_finest(experiment.log, position)):
+            if not (plant.moves and ripple and ripple["n_g"] <= experiment.find_finest(position)):
                 ripple = move_zero(posed, minimum.z, ripple, position)
     dry = 0.0 if friction is None or friction.jump is None else friction.jump(0.0, friction.add_rated(values))
     return Sizes(

@@ -43,8 +43,7 @@ def find_missing_force(experiment: FitExperiment, params: ParameterSet, rows: sl
     """
     data, plant, period = experiment.data, experiment.data.plant, experiment.period
     state = plant.sensing.motor_position if plant.sensing is not None else None
-    channels = {name: data.log[name][rows] for name in plant.states if name in data.log.signals}
-    rates, measured = _pair_rates(plant), [name for name, values in channels.items() if np.any(np.isfinite(values))]
+    rates, measured = _pair_rates(plant), [name for name in plant.states if data.reads(name)]
     if state not in measured or state not in rates:
         return None
     x = {name: data.read(name)[rows] for name in measured}
@@ -61,7 +60,7 @@ def find_missing_force(experiment: FitExperiment, params: ParameterSet, rows: sl
     acceleration = np.gradient(x[rates[state]], period)
     acceleration[1:-1] = np.diff(x[state], 2) / period**2
     force = (np.array(pushed)[moving] - acceleration) / float(effect[moving, 0])
-    there = _find_whole(np.stack([channels[name] for name in measured]))
+    there = _find_whole(np.stack([data.log[name][rows] for name in measured]))
     if np.count_nonzero(there) < FEWEST_READ:
         return None
     position, speed, force = x[state][there], x[rates[state]][there], force[there]

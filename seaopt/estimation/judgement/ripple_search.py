@@ -22,7 +22,6 @@ from jaxtyping import Complex, Float
 
 from seaopt.estimation.judgement.missing_force import find_missing_force
 from seaopt.estimation.problem.correlation import load_fft
-from seaopt.estimation.problem.experiment import find_finest
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.estimation.problem.shapes import Vector
@@ -104,7 +103,7 @@ def find_followed_ripple(
     position, force = missing.position, missing.force
     step, moved = np.pi / float(np.ptp(position)), np.abs(missing.speed) * experiment.period
     top = 2.0 * np.pi * TURNS / max(float(np.quantile(moved, SLOW)), 1e-300)
-    top = min(top, MOST * step, SURE * find_finest(experiment.data.log, missing.state))
+    top = min(top, MOST * step, SURE * experiment.data.find_finest(missing.state))
 
     def weigh(wave: float) -> tuple[float, int, float, float]:
         """Return the share of the force that a wave number accounts for, of how many samples, and both amplitudes."""

@@ -176,15 +176,31 @@ class Experiment:
         return params.with_parameters(*local)
 
     def follow(self, params: ParameterSet) -> Plant:
-        """Return the plant as it is simulated in a fit: where a link moves it follows the positions that the log has
-        finely enough. A link that is held holds the simulated position near the measured one, by its spring.
+        """Return the plant as it is simulated in a fit: where a link moves it follows the positions that are
+        outputs, where they are fine enough. A link that is held holds the simulated position near the measured one, by
+        its spring.
         """
         plant = self.plant
         if not plant.followed or not plant.moves:
             return plant
         values = plant.complete(self.apply_own(params))
-        fine = all(values[each.wave].value <= find_finest(self.log, each.state) for each in plant.followed.values())
+        fine = all(values[each.wave].value <= self.find_finest(each.state) for each in plant.followed.values())
         return follow_readings(plant) if fine else plant
+
+    def reads(self, state: str) -> bool:
+        """Tell whether one of the measured outputs is a state, with enough samples to tell its noise."""
+        return state in self.outputs and np.count_nonzero(np.isfinite(self.log[state])) >= FEWEST_READ
+
+    def find_finest(self, state: str) -> float:
+        """Return how many radians per unit a wave over a state may have, so that noise and steps of what was read of it
+        are a small part of the wave; zero where nothing was.
+        """
+        if not self.reads(state) or is_constant(self.log[state]):
+            return 0.0
+        values = self.log[state][np.isfinite(self.log[state])]
+        # of white noise; motion is slower
+        third = 1.4826 * float(np.median(np.abs(np.diff(values, 3)))) / np.sqrt(20.0)
+        return ROUGH / max(third, find_quantisation(values) / np.sqrt(12.0), 1e-300)
 
     def read(self, state: str) -> Signal:
         """Return what a sensor has read of a state, without the gain and the offset that are known of it; a line where
@@ -409,17 +425,6 @@ class Experiment:
     def _cuts(self, whole: slice) -> list[int]:
         """Return the rows at which a segment of the log is cut into shots, its ends included."""
         return (whole.start + cut_into_shots(whole.stop - whole.start, self.shots)).tolist()
-
-
-def find_finest(log: Log, state: str) -> float:
-    """Return how many radians per unit a wave over a state may have, so that noise and steps of what a log has of it
-    are a small part of the wave; zero where it has none.
-    """
-    values = log[state][np.isfinite(log[state])] if state in log.signals else np.zeros(0)
-    if values.size < FEWEST_READ or is_constant(values):
-        return 0.0
-    third = 1.4826 * float(np.median(np.abs(np.diff(values, 3)))) / np.sqrt(20.0)  # of white noise; motion is slower
-    return ROUGH / max(third, find_quantisation(values) / np.sqrt(12.0), 1e-300)
 
 
 def is_constant(values: Signal) -> bool:

@@ -127,6 +127,17 @@ def test_a_log_without_the_position_and_a_held_link_are_not_followed():
     assert not replace(experiment, plant=held, outputs=("theta_m",)).follow(params).read_inputs
 
 
+def test_an_encoder_that_is_left_out_of_the_outputs_is_not_read():
+    """One of wrong sign would turn the sign of the sine's share, and the fit would look as good."""
+    whole, params = pose(record(), parts=("cogging",), **COGS)
+    experiment = replace(whole, outputs=("theta_l",))
+    assert whole.reads("theta_m") and not experiment.reads("theta_m")
+    assert not experiment.follow(params).read_inputs
+    problem = pose_problem((experiment,), params, loss=Squares())
+    rows = slice(0, len(experiment.log))
+    assert not find_followed_ripple(problem.experiments[0], params, rows, problem.unknowns.start)
+
+
 def test_a_fit_that_went_through_a_pickle_follows_as_before():
     experiment, params = pose(record(), parts=("cogging",), **COGS)
     stored = pickle.loads(pickle.dumps(experiment.plant))
