@@ -1,4 +1,4 @@
-r"""What terms and outer loop of a law feed back, closed around each plant, for figures of the loop as it is exported.
+r"""What the terms of a law feed back, closed around each plant, for figures of the linear loop as it is exported.
 
 A compensation of gravity adds :math:`\gamma G(x)` of the link's position to the law's reference, one of friction
 :math:`c_k = \gamma F_c\, \mathrm{sat}(v_k / v_0)` of the motor's measured speed to its effort. In small motions each is
@@ -8,10 +8,10 @@ the law a column for it,
 .. math:: u = C_r (F_\mathrm{ref} + w) - C_y y + (1 - q)\, s, \qquad w = \gamma G(x), \quad
           s = \frac{\gamma F_c}{v_0} \frac{g\,\theta}{T_s} .
 
-An impedance's outer loop is closed, too, on every plant that has the link's position: with a weight compensated it may
-be what holds the link. Friction is compensated in full where the plant is stuck; where it slides both it and its
-compensation have their full size and no slope. All of a weight compensated leaves a link neutral, on the edge of
-stability: it is closed with `SHORT` less.
+With a weight the impedance's outer loop is closed, too: it may be what holds a weightless link. Without one the figures
+are of the force loop, which the tuner places; what the outer loop does is asked by its passivity. Friction is
+compensated in full where the plant is stuck; where it slides both it and its compensation have their full size and no
+slope. All of a weight compensated leaves a link neutral, on the edge of stability: it is closed with `SHORT` less.
 
 Where nothing holds the link the motor's place drifts, and its difference does not. There the plant has a state
 :math:`\dot m = \dot\theta - (\epsilon / T_s) m` for it, of which the law reads
@@ -100,32 +100,28 @@ def _add_turned(plant: Plant, output: str, rate: float) -> Plant:
     return replace(plant, f=f, states={**plant.states, TURNED: plant.outputs[output]})
 
 
-def feeds_back(controller: Controller, plant: Plant) -> bool:
-    """Tell whether terms or the outer loop of a controller feed something back of a plant of `split_states`."""
-    return _has_outer(controller, plant) or not {WEIGHT, AGAINST}.isdisjoint(plant.outputs)
-
-
-def _has_outer(controller: Controller, plant: Plant) -> bool:
-    return controller.outer is not None and controller.outer.position in plant.outputs
+def shows_terms(plant: Plant) -> bool:
+    """Tell whether a plant of `split_states` has outputs of what terms feed back of it."""
+    return not {WEIGHT, AGAINST}.isdisjoint(plant.outputs)
 
 
 def close_whole(controller: Controller, plant: Plant, params: ParameterSet) -> Loop:
-    """Return the loop of a controller around a plant of `split_states`, with what is fed back of it besides."""
+    """Return the loop of a controller around a plant of `split_states`, with what its terms feed back of it."""
     return close_terms(controller, plant).close(plant, params)
 
 
 def close_terms(controller: Controller, plant: Plant) -> Controller:
-    """Return a controller whose law reads what its terms and its outer loop feed back of a plant of `split_states`; the
-    controller itself where they feed back nothing. Its reference is the force law's.
+    """Return a controller whose law reads what its terms feed back of a plant of `split_states`, and with a weight its
+    outer loop; the controller itself where they feed back nothing. Its reference is the force law's.
     """
-    if not feeds_back(controller, plant):
+    if not shows_terms(plant):
         return controller
-    (law, signals), force = enclose(controller, plant), controller.law
-    n, b, d = force.c.size, law.b.copy(), law.d.copy()
-    b[:n, 0], d[0] = force.b[:, 0], force.d[0]
+    law, signals, force = controller.law, controller.signals, controller.law
     if WEIGHT in plant.outputs:
-        b, d, signals = np.column_stack([b, b[:, 0]]), np.append(d, d[0]), (*signals, WEIGHT)
-    law = replace(law, b=b, d=d)
+        law, signals = enclose(controller, plant)
+        n, b, d = force.c.size, law.b.copy(), law.d.copy()
+        b[:n, 0], d[0] = force.b[:, 0], force.d[0]
+        law, signals = replace(law, b=np.column_stack([b, b[:, 0]]), d=np.append(d, d[0])), (*signals, WEIGHT)
     if AGAINST in plant.outputs:
         n, columns = law.b.shape
         a, b = np.zeros((n + 1, n + 1)), np.zeros((n + 1, columns + 1))
