@@ -31,6 +31,7 @@ EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
+BRIDGED = 4  # missing samples in a row, that a line stands in for without a word
 FEWEST_READ = 16  # samples that tell a reading's noise
 ROUGH = 0.3  # rad of a wave, that takes 4 % of it
 Mask = Literal["auto", "declared", "none"]
@@ -186,6 +187,35 @@ class Experiment:
         values = plant.complete(self.apply_own(params))
         fine = all(values[each.wave].value <= self.find_finest(each.state) for each in plant.followed.values())
         return follow_readings(plant) if fine else plant
+
+    def describe_readings(self, params: ParameterSet) -> list[str]:
+        """Return what a fit makes of the readings that its plant can follow, one sentence each: which are too coarse,
+        and where a line stands in for one.
+        """
+        plant, sentences = self.plant, list[str]()
+        if not plant.moves:
+            return []
+        values, follows = plant.complete(self.apply_own(params)), bool(self.follow(params).read_inputs)
+        for each in plant.followed.values():
+            finest, wave = self.find_finest(each.state), values[each.wave].value
+            longest = self._count_longest_gap(each.state) if finest else 0
+            if 0.0 < finest < wave:
+                sentences.append(
+                    f"{each.state}: noise and steps are {ROUGH * wave / finest:.2g} rad of a wave of {each.wave} = "
+                    f"{wave:.4g}, above {ROUGH:g}: the position is the model's own there"
+                )
+            elif follows and longest > BRIDGED:
+                sentences.append(
+                    f"{each.state}: up to {longest} samples in a row are missing, and the position is a line there: "
+                    "the force that repeats with it is wrong; choose a stretch without (slice_s)"
+                )
+        return sentences
+
+    def _count_longest_gap(self, output: str) -> int:
+        """Return how many samples in a row are missing of an output, at most."""
+        missing = np.concatenate([[0], ~np.isfinite(self.log[output]), [0]]).astype(int)
+        edges = np.flatnonzero(np.diff(missing)).reshape(-1, 2)
+        return int(np.max(np.diff(edges), initial=0))
 
     def reads(self, state: str) -> bool:
         """Tell whether one of the measured outputs is a state, with enough samples to tell its noise."""

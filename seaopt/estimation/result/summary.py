@@ -120,6 +120,7 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
         method=method.key,
         notes=(
             *(f"{experiment.name}: {note}" for experiment in experiments for note in experiment.notes),
+            *(f"{each.name}: {text}" for each in experiments for text in each.describe_readings(fitted)),
             *_find_oddities(fitted, sizes, evaluation),
         ),
         experiments=experiments,

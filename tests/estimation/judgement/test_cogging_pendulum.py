@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import pickle
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -115,6 +116,17 @@ def test_a_coarse_reading_is_not_followed(step, follows):
     """Of 42 waves per rad one of 0.05 rad is 2.1 rad of a wave: the model's own position is better."""
     experiment, params = pose(record(step=step), parts=("cogging",), **COGS)
     assert bool(experiment.follow(params).read_inputs) is follows
+    said = experiment.describe_readings(params)
+    assert bool(said) is not follows
+    rounded = COGS["n_g"] * step / math.sqrt(12.0)  # the noise besides is a third of a step
+    assert follows or rounded < float(re.search(r"are (.*?) rad", said[0])[1]) < 2.0 * rounded
+
+
+@pytest.mark.parametrize(("missing", "says"), [(0, False), (3, False), (400, True)])
+def test_a_line_in_place_of_a_position_is_told(missing, says):
+    experiment, params = pose(_hide(record(), "theta_m", slice(1000, 1000 + missing)), parts=("cogging",), **COGS)
+    said = experiment.describe_readings(params)
+    assert [f"up to {missing} samples" in text for text in said] == [True] * says
 
 
 def test_a_log_without_the_position_and_a_held_link_are_not_followed():
