@@ -48,7 +48,7 @@ from seaopt.robustness.verification.schedule_sweep import Sweep
 from seaopt.robustness.verification.verification import Verification, make_stages
 
 FILE, CERTIFY_AGAIN = "robustness.json", "certify again"
-SAME_FIGURES = 1e-3  # of Ms and Mt, below which the loop that a file is of is the one that is closed today
+SAME_FIGURES = 1e-5  # of Ms and Mt, below which the loop that a file is of is the one that is closed today
 
 
 @record
