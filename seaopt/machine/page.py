@@ -130,7 +130,8 @@ def say_difference(each: Difference) -> str:
                 f"{each.name} stops at {format_number(each.value)}{unit_after(each.unit)}: its sensor is at its range"
             )
         case "delay":
-            return f"the loop is {1e3 * each.value:+.3g} ms later than certified"
+            way = "later" if each.value > 0.0 else "earlier"
+            return f"the loop is {abs(1e3 * each.value):.3g} ms {way} than certified"
         case "mode":
             pole = "" if each.size is None else f", its pole at {format_number(each.value / each.size, 3)} Hz"
             return f"there is a mode at {format_number(each.value, 3)} Hz{pole}"
@@ -271,11 +272,19 @@ def _say_extent(part: Measured) -> str:
     return f"{counts[0]}, {counts[1]} of phases, {part.f.size} lines from {low} to {high} Hz"
 
 
+def _show_range(each: Difference) -> str:
+    """Return the interval of a difference, of a delay in ms as it is said."""
+    if each.low is None or each.high is None:
+        return ""
+    scale, unit = (1e3, " ms") if each.kind == "delay" else (1.0, "")
+    return f"{format_number(scale * each.low, 3)} to {format_number(scale * each.high, 3)}{unit}"
+
+
 def _describe_differences(differences: Differences) -> Section:
     rows = tuple(
         (
             say_difference(each),
-            "" if each.low is None else f"{format_number(each.low, 3)} to {format_number(each.high, 3)}",
+            _show_range(each),
             f"{100.0 * each.explains:.3g} %",
         )
         for each in differences.found

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from seaopt.errors import SimulationError
 from seaopt.records import record
-from seaopt.signals import MatrixNN, VectorM, VectorN
+from seaopt.signals import VectorM, VectorN
 from seaopt.simulation.discretisation import Clock
 
 MAX_SECTIONS = 8  # as in layout.h
@@ -182,7 +182,9 @@ class Pass:
     outputs: Float[np.ndarray, "n ny"] | None = None  # model outputs, without gain and offset
     columns: Float[np.ndarray, "n ny nc"] | None = None  # the v of every sample
     states: Float[np.ndarray, "n nx"] | None = None  # state trajectory
-    sensitivity: MatrixNN | None = None  # of the last state to the first, of long logs of nonlinear plants
+    sensitivity: Float[np.ndarray, "nx nx"] | None = (
+        None  # of the last state to the first, of long logs of nonlinear plants
+    )
 
 
 def layout_of(nx: int, ny: int, np_: int, point: Point) -> Layout:

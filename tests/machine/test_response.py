@@ -247,3 +247,11 @@ def test_a_figure_at_its_limit_is_said_to_be_so_in_place_of_hours_to_record(cont
     assert ms.outcome == "undecided" and ("no record of sensible length" in words) == near, ms
     assert f"{ms.periods} periods in all" not in words if near else ms.near is None
     assert not near or np.isclose(ms.near, abs(beyond), rtol=0.01)
+
+
+def test_a_loop_that_ran_away_is_told_to_check_its_signs(controller, bench):
+    """Of a force that the sensor has with its sign turned: the law does what it is told, and the loop runs away."""
+    log = bench.log(Machine(drive_sign=-1.0), multisine(1000, LINES, 4, 60.0, 3))
+    assert np.mean(np.abs(log["I"]) > 0.99 * controller.command_limit) > 0.9
+    result = so.accept(controller, [log])
+    assert "check the signs of command and readings" in " ".join(repr(result).split())

@@ -219,7 +219,7 @@ class Experiment:
 
     def reads(self, state: str) -> bool:
         """Tell whether one of the measured outputs is a state, with enough samples to tell its noise."""
-        return state in self.outputs and np.count_nonzero(np.isfinite(self.log[state])) >= FEWEST_READ
+        return state in self.outputs and int(np.count_nonzero(np.isfinite(self.log[state]))) >= FEWEST_READ
 
     def find_finest(self, state: str) -> float:
         """Return how many radians per unit a wave over a state may have, so that noise and steps of what was read of it

@@ -19,6 +19,7 @@ LIKE = 0.25  # of the autocorrelation at zero: what a period's is at least
 REPEATS = 0.2  # of the rows, that repeat after a period at least
 SAME = 1e-4  # of the reference's range: rows that are alike
 WEAKEST = 1e-2  # of the strongest line
+STAYS = 0.9  # of the ticks at the limit: a loop that ran away, and no amplitude that is too large
 TRANSIENT = 1  # periods that are left out at the start of each stretch
 SAME_AMPLITUDE = 0.1  # relative
 
@@ -120,6 +121,9 @@ def cut_periods(controller: Controller, ticks: Ticks) -> Blocks:
     if len(free) < 2:
         reached = len(starts) - len(free)
         why = f"in {reached} of them the command is at its limit: lower the amplitude" if reached else "record more"
+        stays = float(np.mean(np.abs(ticks.command) >= limit))
+        if stays > STAYS:
+            why = f"its command stays at the limit ({stays:.0%} of the ticks): check the signs of command and readings"
         raise LogError(
             f"{ticks.source}: it has {format_count(len(free), 'whole period')} of {period * seconds:.3g} s after the "
             f"first of each stretch; {why}, at least 3 periods are needed"

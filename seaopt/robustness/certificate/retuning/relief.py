@@ -66,9 +66,10 @@ def find_relief(
     terms, outer, least = law.compensation, law.outer, law.spec.bandwidth_range_hz[0]
     lower = [float(f"{share * law.spec.bandwidth_hz:.3g}") for share in SLOWER]
     lower = [band for band in lower if band >= least]
-    compensates = terms is not None and (terms.friction is not None or terms.gravity is not None)
     return Relief(
-        compensated=bisect(lambda share: replace(law, compensation=_scale(terms, share))) if compensates else None,
+        compensated=None
+        if terms is None or (terms.friction is None and terms.gravity is None)
+        else bisect(lambda share: replace(law, compensation=_scale(terms, share))),
         rendered=None if outer is None else bisect(lambda share: replace(law, outer=_soften(outer, share))),
         bandwidth_hz=next((band for band in lower if keeps(tune_at, band)), None),
         tried_hz=(*lower,),
