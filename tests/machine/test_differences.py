@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 import seaopt as so
 from seaopt.machine.differences.certified import compare
+from seaopt.machine.differences.comparison import Comparison
 from seaopt.machine.differences.joint import explains
 from seaopt.machine.differences.leeway import take_spread
 from seaopt.machine.response.discs import Ratio
@@ -207,10 +208,12 @@ def test_the_joint_probability_of_what_is_left_is_the_one_that_is_stated(control
     """Right machines are refused as often as is stated, where none of the difference is tolerated, by simulation."""
     rng, blocks, m, alpha = np.random.default_rng(4), 6, 20, 0.1
     truth = np.exp(-1j * np.linspace(0.1, 3.0, m))
-    refused = 0
+    refused, lines = 0, create_autospec(Comparison, instance=True)
     for _ in range(2000):
         noise = rng.normal(size=(blocks, m)) + 1j * rng.normal(size=(blocks, m))
-        ratio = Ratio(numerator=truth + 1e3 * noise, denominator=np.ones((blocks, m)))  # 2 % of it is nothing then
-        lines = SimpleNamespace(response=ratio.value, std=ratio.std, ratios=[ratio])
+        ratio = Ratio(
+            numerator=truth + 1e3 * noise, denominator=np.ones((blocks, m), dtype=complex)
+        )  # 2 % of it is nothing then
+        lines.response, lines.std, lines.ratios = ratio.value, ratio.std, [ratio]
         refused += not explains(lines, truth, alpha)
     assert abs(refused / 2000 - alpha) < 0.025
