@@ -15,7 +15,7 @@ the force is what the measured motion lacks (`missing_force`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -41,6 +41,7 @@ SURE = 1.0 / 3.0  # of the wave number that a reading is fine enough for: its st
 SLOW = 0.2  # of the samples that have to be as slow as that
 
 Spectra = Complex[np.ndarray, "ny f"]
+Weight = tuple[float, int, float, float]  # share that a wave number accounts for, of so many samples; both amplitudes
 
 
 def find_ripple(
@@ -58,11 +59,9 @@ def find_ripple(
     position, raw = position[looked], left.segments[number].raw.T[:, looked]
     raw = np.nan_to_num(raw - np.nanmean(raw, axis=1, keepdims=True))
     size = np.sqrt(np.sum(raw**2, axis=1))
-    travel, moved = float(np.ptp(position)), np.abs(np.gradient(position))
-    if not travel or not np.all(size > 0.0):
+    moved = np.abs(np.gradient(position))
+    if not np.ptp(position) or not np.all(size > 0.0):
         return {}
-    step = np.pi / travel
-    top = min(2.0 * np.pi * TURNS / max(float(np.quantile(moved, SLOW)), 1e-300), MOST * step)
     residual = load_fft().rfft(raw / size[:, None])
     gain = _respond(experiment.data.plant, params, experiment.data.outputs, experiment.period, position.size)
     nearby = min(NEARBY, residual.shape[1])
@@ -70,8 +69,7 @@ def find_ripple(
     own = np.sqrt(np.maximum(own, 1e-300))
     residual, gain = residual / own, gain / size[:, None] / own
 
-    def weigh(wave: float) -> tuple[float, float, float]:
-        """Return the share of an output's power that a wave number accounts for, and both amplitudes."""
+    def weigh(wave: float) -> Weight:
         slow = moved * wave < 2.0 * np.pi * TURNS
         turned = load_fft().rfft(np.stack([np.sin(wave * position), np.cos(wave * position)]) * slow)
         columns = gain[:, None, :] * turned
@@ -80,15 +78,10 @@ def find_ripple(
         amplitudes = np.linalg.lstsq(gram, right, rcond=1e-9)[0]
         rest = residual - np.einsum("c,ocf->of", amplitudes, columns)
         share = 1.0 - np.sum(np.abs(rest) ** 2, axis=1) / np.sum(np.abs(residual) ** 2, axis=1)
-        return float(np.max(share)), float(amplitudes[0]), float(amplitudes[1])
+        return float(np.max(share)), position.size, float(amplitudes[0]), float(amplitudes[1])
 
     force = load_fft().irfft(np.sum(np.conj(gain) * residual, axis=0), position.size)
-    best = max(_list_waves(position, force, moved, step, top), key=lambda wave: weigh(wave)[0], default=0.0)
-    if not best:
-        return {}
-    best = max(best + step * np.linspace(-1.0, 1.0, 2 * FINE + 1), key=lambda wave: weigh(wave)[0])
-    share, a, b = weigh(best)
-    return {"a_g": a, "b_g": b, "n_g": float(best)} if share > max(LEAST, OF_CHANCE / position.size) else {}
+    return _search_waves(position, force, moved, weigh)
 
 
 def find_followed_ripple(
@@ -100,19 +93,30 @@ def find_followed_ripple(
     missing = find_missing_force(experiment, params, rows, z)
     if missing is None:
         return {}
-    position, force = missing.position, missing.force
-    step, moved = np.pi / float(np.ptp(position)), np.abs(missing.speed) * experiment.period
-    top = 2.0 * np.pi * TURNS / max(float(np.quantile(moved, SLOW)), 1e-300)
-    top = min(top, MOST * step, SURE * experiment.data.find_finest(missing.state))
+    position, force, moved = missing.position, missing.force, np.abs(missing.speed) * experiment.period
 
-    def weigh(wave: float) -> tuple[float, int, float, float]:
-        """Return the share of the force that a wave number accounts for, of how many samples, and both amplitudes."""
+    def weigh(wave: float) -> Weight:
         slow = moved * wave < 2.0 * np.pi * TURNS
         waves = np.column_stack([np.sin(wave * position[slow]), np.cos(wave * position[slow])])
         a, b = np.linalg.lstsq(waves, force[slow], rcond=1e-9)[0]
         rest = force[slow] - waves @ (a, b)
         return 1.0 - float(np.sum(rest**2) / np.sum(force[slow] ** 2)), int(np.sum(slow)), float(a), float(b)
 
+    return _search_waves(position, force, moved, weigh, SURE * experiment.data.find_finest(missing.state))
+
+
+def _search_waves(
+    position: Float[np.ndarray, " n"],
+    force: Float[np.ndarray, " n"],
+    moved: Float[np.ndarray, " n"],
+    weigh: Callable[[float], Weight],
+    finest: float = np.inf,
+) -> Mapping[str, float]:
+    """Return the cogging of the wave number that weighs most, up to the `finest`; empty where none counts. `force`: by
+    which those that are worth a look are looked up; `moved`: from one sample to the next.
+    """
+    step = np.pi / float(np.ptp(position))
+    top = min(2.0 * np.pi * TURNS / max(float(np.quantile(moved, SLOW)), 1e-300), MOST * step, finest)
     best = max(_list_waves(position, force, moved, step, top), key=lambda wave: weigh(wave)[0], default=0.0)
     if not best:
         return {}
