@@ -17,7 +17,7 @@ from seaopt.formatting import format_count
 from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
 from seaopt.logs.quality.channel import BEYOND
-from seaopt.logs.quality.faults import find_quantisation
+from seaopt.logs.quality.faults import find_quantisation, find_runs
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import follow_readings
@@ -213,9 +213,7 @@ class Experiment:
 
     def _count_longest_gap(self, output: str) -> int:
         """Return how many samples in a row are missing of an output, at most."""
-        missing = np.concatenate([[0], ~np.isfinite(self.log[output]), [0]]).astype(int)
-        edges = np.flatnonzero(np.diff(missing)).reshape(-1, 2)
-        return int(np.max(np.diff(edges), initial=0))
+        return int(np.max(find_runs(~np.isfinite(self.log[output])).lengths, initial=0))
 
     def reads(self, state: str) -> bool:
         """Tell whether one of the measured outputs is a state, with enough samples to tell its noise."""
