@@ -182,9 +182,7 @@ class Pass:
     outputs: Float[np.ndarray, "n ny"] | None = None  # model outputs, without gain and offset
     columns: Float[np.ndarray, "n ny nc"] | None = None  # the v of every sample
     states: Float[np.ndarray, "n nx"] | None = None  # state trajectory
-    sensitivity: Float[np.ndarray, "nx nx"] | None = (
-        None  # of the last state to the first, of long logs of nonlinear plants
-    )
+    sensitivity: Float[np.ndarray, "nx nx"] | None = None  # of the last state to the first: long logs, nonlinear plants
 
 
 def layout_of(nx: int, ny: int, np_: int, point: Point) -> Layout:

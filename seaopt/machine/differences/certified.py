@@ -15,9 +15,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from seaopt.control import Controller
-from seaopt.machine.differences.comparison import Comparison
+from seaopt.machine.differences.comparison import TOLERATED, Comparison
 from seaopt.machine.differences.explanations import Difference, explain
-from seaopt.machine.differences.joint import TOLERATED, is_one_of
+from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
 from seaopt.machine.response.periods import shorten
 from seaopt.machine.response.verdicts import Measured, has_dry_friction

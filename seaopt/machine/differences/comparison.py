@@ -24,6 +24,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
+TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
 Lines = Complex[np.ndarray, " m"]
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control.loops.sampled_plant import DELAYS
-from seaopt.machine.differences.comparison import Comparison, Lines
+from seaopt.machine.differences.comparison import TOLERATED, Comparison, Lines
 from seaopt.machine.differences.leeway import Leeway, Spread, take_spread
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.records import record
@@ -36,11 +36,9 @@ MOST_LOG = 1.5  # of a factor: its logarithm goes no further
 MOST_SPREAD = 10.0  # of a factor's logarithm, above which the log does not tell the factor
 RIVAL = 20.0  # times what the best parameter leaves: parameters whose leeway is looked at where they are
 WORTH = 2.0  # times what noise leaves: a misfit above has causes
-UNTOLD = (
-    5.4  # of the misfit, in what noise leaves of a line: twice the difference of two causes is a chi square, 99.9 %
-)
+# Of the misfit, in what noise leaves of a line: twice the difference of two causes is a chi square, 99.9 %.
+UNTOLD = 5.4
 ALIKE = 2.0  # times what the best of some causes leaves of other outputs: causes that go with these as well
-TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
 MODE_DAMPINGS = (0.02, 0.1)
 SEEN = 5.0  # std by which a line differs where a mode is looked for
 MODE_COST = 2.0  # by which a mode, of several sizes, has to leave less than another cause does

@@ -17,11 +17,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.machine.differences.comparison import Comparison, Lines
+from seaopt.machine.differences.comparison import TOLERATED, Comparison, Lines
 from seaopt.machine.differences.leeway import Spread
 from seaopt.robustness.uncertainty.worst import place_values
 
-TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
 ROUNDS = 6  # of Gauss and Newton
 STEP = 0.02  # of the draws' width along an axis, for slopes
 
