@@ -34,7 +34,7 @@ from seaopt.records import Result, Worded, record
 PARTS = 4  # of every stretch between two points, at whose ends the limits are judged
 LEAST_BANDWIDTH = 0.9  # of the one asked, that the law has between the points
 SAME_GAIN = 0.01  # of its largest, by which a gain that is called the same may change
-ROOM = 0.03  # a reserve that is advised where a limit is broken between the points
+RESERVE_BETWEEN = 0.03  # with which a limit that is broken between the points may be kept there
 LARGE_STEP = 1.0  # of a gain between neighbours, over the smaller of the two, from which it is remarked on
 # The keys of controller.json that hold a list, with an entry for each point; all others are those of the first.
 PER_POINT = (
@@ -150,7 +150,7 @@ class ScheduledController(Result, Worded):
         stretches = pairwise(self.points)
         middles = [0.5 * (low + high) for low, high in stretches if any(low < value < high for value in missed)]
         points = ", ".join(f"{value:.4g}" for value in sorted((*self.points, *middles)))
-        room = f"; or tune with more room: reserve = {ROOM:g}" if self.spec.reserve < ROOM else ""
+        room = f"; or tune with more room: reserve = {RESERVE_BETWEEN:g}" if self.spec.reserve < RESERVE_BETWEEN else ""
         return f"add points where it is broken: points = [{points}]{room}"
 
     @property

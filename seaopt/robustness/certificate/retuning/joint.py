@@ -223,7 +223,15 @@ def tune_certified(
     values = (others or ParameterSet()).with_parameters(*fitted.values())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
     share, asked = 1.0 - (1.0 - confidence) / rounds, spec
+
+    def tune_at(bandwidth_hz: float) -> Controller:
+        law = tune(plant, values, replace(asked, bandwidth_hz=bandwidth_hz), robust_to, draws=draws)
+        return law if complete is None else complete(law)
+
+    drawn = {"parameters": parameters, "ranges": ranges or {}, "others": others or ParameterSet()}
+    look = partial(look_at_draws, plants=plants, **drawn)
     finished: list[Round] = []
+    strained: Controller | None = None  # the first law that what it feeds back besides takes beyond a limit at draws
     for number, part in enumerate(divide(progress, *(1.0 for _ in range(rounds))), start=1):
         tuning, certifying = divide(prefix(part, f"round {number}"), TUNING, CERTIFYING)
         options: dict[str, Any] = {"robust_to": witnesses, "draws": draws, "progress": tuning}
@@ -253,7 +261,10 @@ def tune_certified(
         added = _list_new_witnesses(certificate, [(plant, values), *pairs], number)
         plants_met = 1 + len(witnesses)
         made: dict[str, Any] = {"controller": controller, "certificate": certificate}
-        raised = raise_reserve(spec, [] if certificate is None or certificate.passed else _list_over(certificate))
+        over_limits = [] if certificate is None or certificate.passed else _list_over(certificate)
+        raised = raise_reserve(spec, over_limits)
+        if strained is None and isinstance(controller, Controller) and any(each.needed for each in over_limits):
+            strained = controller if certificate is not None and certificate.varied else None
         finished.append(Round(number=number, plants=plants_met, added=(*added,), **made))
         if certificate is None:
             status = "infeasible"
@@ -268,21 +279,7 @@ def tune_certified(
         else:
             witnesses, spec = witnesses | added, raised
             continue
-        relief = None
-        if status != "certified" and over is None:
-
-            def tune_at(bandwidth_hz: float) -> Controller:
-                law = tune(plant, values, replace(asked, bandwidth_hz=bandwidth_hz), robust_to, draws=draws)
-                return law if complete is None else complete(law)
-
-            look = partial(
-                look_at_draws,
-                plants=plants,
-                parameters=parameters,
-                ranges=ranges or {},
-                others=others or ParameterSet(),
-            )
-            relief = _find_relief(finished, tune_at, look)
+        relief = None if status == "certified" or strained is None else find_relief(strained, tune_at, look)
         progress(f"{status} after {format_count(number, 'round')}", 1.0)
         return JointTuning(status=status, rounds=tuple(finished), robust_to=witnesses, relief=relief, **made)
     raise AssertionError("the last round has a status")
@@ -296,20 +293,6 @@ def _list_over(certificate: Certificate) -> list[Look]:
         for case in place.worst.values()
     )
     return [each for each in looks if each.is_over]
-
-
-def _find_relief(
-    rounds: Sequence[Round], tune_at: Callable[[float], Controller], look: Callable[[Controller], Mapping[str, Look]]
-) -> Relief | None:
-    """Return what would do in place of the first law that what it feeds back besides takes beyond a limit; None where
-    nothing is uncertain, of which no draws can be looked at.
-    """
-    for each in rounds:
-        law, certificate = each.controller, each.certificate
-        beyond = [] if certificate is None or not certificate.varied else _list_over(certificate)
-        if isinstance(law, Controller) and any(case.needed for case in beyond):
-            return find_relief(law, tune_at, look)
-    return None
 
 
 def _list_new_witnesses(

@@ -21,6 +21,7 @@ import numpy as np
 
 from seaopt.control import Controller, ControllerSpec, ScheduledController
 from seaopt.control.laws.limits import LIMIT_ROUNDING
+from seaopt.control.scheduling.scheduled_controller import RESERVE_BETWEEN
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -39,7 +40,6 @@ ROUNDS = 3  # of looking and tuning again
 ROOM = 1e-3  # more than what was found asks, as the next law is another
 MOST_RESERVE = 0.15  # that is given unasked: what needs more lacks points, or a term asks too much
 NEAR = 0.98  # of the limits: what uses less is no witness
-BETWEEN = 0.03  # of a schedule that breaks a limit between its points at the nominal parameters already
 Witnesses = Mapping[str, tuple[Plant, ParameterSet]]
 Make = Callable[[ControllerSpec, Witnesses, ScheduledController | None, Progress], ScheduledController]
 
@@ -133,7 +133,7 @@ def keep_reserve(
         if missed >= least:
             break
         kept, least, left = schedule, missed, over
-        raised = raise_reserve(spec, over.values(), BETWEEN if broken else 0.0)
+        raised = raise_reserve(spec, over.values(), RESERVE_BETWEEN if broken else 0.0)
         if not missed or raised is None or part is None:
             break
         spec = raised
