@@ -23,10 +23,11 @@ from seaopt.files import read_json, to_json, write_json, write_text
 from seaopt.logs import write_log
 from seaopt.machine import Acceptance, BringUp, Stage, accept, bring_up
 from seaopt.machine.acceptance import take_ranges
-from seaopt.machine.bringup import OF_A_STAGE, slow_down
+from seaopt.machine.bringup import BRINGUP_SCHEMA, FULL, OF_A_STAGE, slow_down
 from seaopt.machine.bringup_files import write_stage
 from seaopt.machine.bringup_page import write_bring_up_page
 from seaopt.machine.page import write_acceptance_page
+from seaopt.machine.response.periods import Played
 from seaopt.machine.stepped import Source
 from seaopt.problem import Problem, certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
@@ -36,7 +37,7 @@ from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.signals import REFERENCE
 
 FILE, PAGE = "acceptance.json", "acceptance.html"
-BRING_UP = "bringup"  # the folder of the stages
+BRING_UP, PLAN = "bringup", "bringup.json"  # the folder of the stages, and what they are
 AGAIN = "again"  # the folder of accepted logs, for a fit
 TABLES = """# A loop carries noise back into its command: fit such logs by prediction errors.
 # In the problem file: [fit] with method = "prediction_error", and these tables.
@@ -92,6 +93,7 @@ def accept_logs(
             others=_find_others(folder, path, controller),
             uncertainty=session.parameters(),
             ranges=take_ranges(controller, session.problem.ranges),
+            played=_find_played(folder, stage),
         )
     content = write(result, session, logs)
     again = write_again(result, session)
@@ -114,6 +116,19 @@ def _show(
         show_sections(console, result, verbose=amount == "verbose")
         console.list_files(files)
     return result.met
+
+
+def _find_played(folder: Path, stage: str | None) -> Played | None:
+    """Return how long the reference of a stage is, by the bring-up of a folder; None where it has no such stage."""
+    try:
+        stages = read_json(folder / BRING_UP / PLAN, BRINGUP_SCHEMA)["stages"]
+    except SeaoptError:  # none was planned, or it was edited
+        return None
+    found = next((each["reference"] for each in stages if each["name"] == (stage or FULL)), None)
+    if found is None:
+        return None
+    periods = found["periods"] * found["phases"] + 2  # one that fades in, and one that fades out
+    return Played(period_s=found["period_s"], lasts_s=periods * found["period_s"])
 
 
 def _read_stage(session: Session, path: Path) -> Source:
@@ -218,7 +233,7 @@ def plan_bring_up(
 
         def keep_stage(stage: Stage) -> None:
             # What an earlier run planned is not said of these stages.
-            (target / "bringup.json").unlink(missing_ok=True)
+            (target / PLAN).unlink(missing_ok=True)
             write_stage(stage, target / stage.name, tare=zeroing)
             tell(f"wrote {target / stage.name}")
 
@@ -236,7 +251,7 @@ def plan_bring_up(
             keep_stage=keep_stage,
             progress=tell,
         )
-    write_json(target / "bringup.json", plan.to_dict())
+    write_json(target / PLAN, plan.to_dict())
     page = write_bring_up_page(
         plan,
         target / "bringup.html",
@@ -244,7 +259,7 @@ def plan_bring_up(
         files=[Path(session.problem.source)],
         command=spell_call(),
     )
-    files = [target / "bringup.json", page, *(target / stage.name for stage in plan.stages)]
+    files = [target / PLAN, page, *(target / stage.name for stage in plan.stages)]
     return _show(plan, plan.to_dict(), files, json=json, amount=amount)
 
 

@@ -22,7 +22,7 @@ from seaopt.machine.causes import Cause
 from seaopt.machine.decimated import shift_command
 from seaopt.machine.differences.certified import Differences, compare
 from seaopt.machine.replay import Replay, replay
-from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
+from seaopt.machine.response.periods import Blocks, Played, cut_periods, find_refused, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Source, stand
 from seaopt.machine.ticks import Ticks, take_ticks
@@ -115,6 +115,7 @@ def accept(
     uncertainty: Fit | ParameterSet | None = None,
     ranges: Mapping[str, tuple[float, float]] | None = None,
     confidence: float = 0.95,
+    played: Played | None = None,
 ) -> Acceptance:
     """Judge logs that were recorded under a controller's exported law.
 
@@ -137,6 +138,8 @@ def accept(
         As in `certify`, of what the design plant has.
     confidence : float
         Of each statement on the response.
+    played : Played, optional
+        How long the reference is that was to be played: a log that is shorter than its period is told so.
 
     Returns
     -------
@@ -227,7 +230,8 @@ def accept(
         try:
             if ticks.rendered is not None:
                 raise LogError(OUTER_LOOP)
-            cut = cut_periods(law, ticks if place is None else require_still(controller, ticks))
+            refused = find_refused(law, ticks) if row.ticks_per_row == 1 else None
+            cut = cut_periods(law, ticks if place is None else require_still(controller, ticks), refused, played)
             blocks.append(shift_command(law, cut, row.command_late) if row.ticks_per_row > 1 else cut)
         except LogError as error:
             left_out[ticks.source] = str(error)

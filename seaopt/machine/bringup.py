@@ -27,7 +27,7 @@ from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.signals import REFERENCE
 
 BRINGUP_SCHEMA = "seaopt/bringup/1"
-FRACTIONS = (0.25, 0.5)
+FRACTIONS, FULL = (0.25, 0.5), "full"  # what the stages before the last ask for, and the name of the last
 UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
 DRAWS, SEED = 60, 1
 STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
@@ -268,7 +268,7 @@ def bring_up(
         tell("certifying the law itself")
         certificate = certifying(controller)
     for number, place in enumerate(places, start=1):
-        name = "full" if len(places) == 1 else f"full_{number}"
+        name = FULL if len(places) == 1 else f"{FULL}_{number}"
         keep(_make_stage(name, controller, certificate, "", draws, options | {"place": place}))
     return BringUp(stages=tuple(stages))
 

@@ -13,11 +13,23 @@ from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.explanations import Difference
 from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Replay
+from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, Judged, Measured, Response
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
-from seaopt.reporting.sections.data import Commands, KeyFigure, Mark, Reason, Section, Style, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import (
+    Commands,
+    Item,
+    KeyFigure,
+    Mark,
+    Reason,
+    Section,
+    Style,
+    Table,
+    Verdict,
+    mark_met,
+)
 from seaopt.units import unit_after
 
 PARTS = {
@@ -54,6 +66,10 @@ OPEN = {
     "aliases": "lines of the reference above half of the log's rate come back as others; play slower ones, or log "
     "every tick",
 }
+STABILITY = (
+    "Stability is the least |1 + L| over the radius of its disc (no unit): above 1 no disc holds zero, where the loop "
+    "would be at its limit of stability."
+)
 UNTOLD = {
     "short, gain": "a law whose {} is half as large",
     "short, factor": "a {} that is halved",
@@ -238,10 +254,8 @@ def _describe_response(response: Response, left_out: Mapping[str, str]) -> Secti
         (
             row.name,
             "" if row.limit is None else Mark(text=row.outcome, style=OUTCOMES[row.outcome]),
-            ""
-            if row.limit is None or row.name == "stability"
-            else f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}",
-            "" if row.name == "stability" else f"{format_number(row.value, 3)}{unit_after(row.unit)}",
+            "" if row.limit is None else f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}",
+            f"{format_number(row.value, 3)}{unit_after(row.unit)}",
             "" if row.name == "stability" else _show_interval(row),
             format_number(row.predicted, 3, ""),
             format_number(row.where_hz, 3),
@@ -254,15 +268,24 @@ def _describe_response(response: Response, left_out: Mapping[str, str]) -> Secti
     remarks = [
         f"Each statement holds with a probability of {100.0 * response.confidence:g} %. Limits are those of the "
         "specification with 5 % of grace, of the bandwidth 10 %; with dry friction that of the plant that is stuck. "
-        "Nothing is said between the lines and beyond them."
+        "Nothing is said between the lines and beyond them.",
+        STABILITY,
     ]
     if response.at_amplitude_only:
         remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
     if any(row.outcome == "undecided" for row in response.judged if row.limit is not None):
         remarks.append(f"Undecided is no doubt about the machine: the log does not decide {_say_undecided(response)}.")
     remarks += [f"Left out: {text}" for text in left_out.values()]
+    items = tuple(_warn_left_out(part) for part in response.measured if part.left_out.total)
     tables = (Table(head=head, rows=rows, align="<<>>>>>>", optional=("periods needed",)),)
-    return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks))
+    return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks), items=items)
+
+
+def _warn_left_out(part: Measured) -> Item:
+    """Return how many periods are not used, why, and what to do."""
+    total, why = part.left_out.total, "; ".join(say_left_out(part.left_out))
+    text = f"{total} of {format_count(part.periods + total, 'period')} left out: {why}"
+    return Item(severity="warning", text=text)
 
 
 def _say_extent(part: Measured) -> str:
@@ -340,7 +363,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         Section(
             title="Replay",
             part="replay",
-            tables=(Table(head=head, rows=rows, align="<<>>>>>>>", optional=("rate (Hz)", "at limit")),),
+            tables=(Table(head=head, rows=rows, align="<<>>>>>>>", optional=("rounding", "rate (Hz)")),),
             remarks=(
                 "The law is fed with the logged reference and readings; its command is compared with the log's.",
                 *remarks,

@@ -12,7 +12,7 @@ import seaopt as so
 from seaopt.machine.excitation import design_excitation
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.measured_margins import list_margins
-from seaopt.machine.response.periods import cut_periods, find_period
+from seaopt.machine.response.periods import LeftOut, cut_periods, find_period
 from seaopt.machine.response.verdicts import Measured
 from seaopt.machine.ticks import take_ticks
 from tests.machine.simulator import Bench, Machine, multisine
@@ -140,6 +140,13 @@ def test_phases_are_told_apart_and_the_first_period_of_each_is_left_out(controll
     assert blocks.realisations == 6 and len(blocks.reference) == 12 and np.allclose(blocks.f, LINES)
 
 
+@pytest.mark.parametrize("bias", [0.0, 600.0, 3000.0])
+def test_the_period_is_found_under_a_bias_that_fades_in(bias):
+    wave, rise = multisine(1000, LINES, 1, 60.0, 3), np.linspace(0.0, 1.0, 1000)
+    reference = np.concatenate([rise * (bias + wave), bias + np.tile(wave, 6), rise[::-1] * (bias + wave)])
+    assert find_period(reference) == 1000
+
+
 @pytest.mark.parametrize(
     ("reference", "says"),
     [
@@ -228,7 +235,7 @@ def test_margins_of_a_loop_that_crosses_a_gain_of_one_three_times(controller):
             "delay margin": 1e3 * np.min(margins % (2.0 * np.pi) / w[at]),
         }
         ratio = Ratio(numerator=np.tile(loop, (2, 1)), denominator=np.ones((2, f.size)) + 0j)
-        counts = {"periods": 2, "blocks": 2, "phases": 1, "amplitude": 1.0, "saturated": 0}
+        counts = {"periods": 2, "blocks": 2, "phases": 1, "amplitude": 1.0, "left_out": LeftOut()}
         part = Measured(f=f, loop=ratio, tracking=ratio, outputs={"F1": ratio}, **counts)
         rows = {row.name: row.value for row in list_margins(controller, [part], 0.05)}
         assert gain != 9.0 or np.isclose(rows["phase margin"], 61.68, atol=0.05)  # the others are -125 and 64 degrees

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.machine.response.discs import Ratio
+from seaopt.machine.response.periods import LeftOut
 from seaopt.records import record
 
 Outcome = Literal["confirmed", "refuted", "undecided"]
@@ -44,7 +45,7 @@ class Measured:
     blocks: int
     phases: int
     amplitude: float
-    saturated: int  # periods that were left out
+    left_out: LeftOut
 
     @property
     def distance(self) -> Complex[np.ndarray, " m"]:

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from seaopt.control import Controller
+from seaopt.control import Controller, GateState
 from seaopt.errors import LogError
-from seaopt.formatting import format_count
+from seaopt.formatting import format_count, join_words
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
@@ -22,6 +22,31 @@ WEAKEST = 1e-2  # of the strongest line
 STAYS = 0.9  # of the ticks at the limit: a loop that ran away, and no amplitude that is too large
 TRANSIENT = 1  # periods that are left out at the start of each stretch
 SAME_AMPLITUDE = 0.1  # relative
+
+
+@record
+class Played:
+    """How long a reference is that was to be played."""
+
+    period_s: float
+    lasts_s: float  # all of it
+
+
+@record
+class LeftOut:
+    """Periods after the first of each stretch that are not used, by why; of a gap as many as its rows would make."""
+
+    limit: int = 0  # the command was at its limit
+    gate: int = 0  # a reading was not believed, and the one before it stood in
+    gap: int = 0  # beyond a gap, or with a number missing
+
+    @property
+    def total(self) -> int:
+        """How many in all."""
+        return self.limit + self.gate + self.gap
+
+    def __add__(self, other: LeftOut) -> LeftOut:
+        return LeftOut(limit=self.limit + other.limit, gate=self.gate + other.gate, gap=self.gap + other.gap)
 
 
 @record(eq=False)
@@ -37,7 +62,7 @@ class Blocks:
     rows: int  # of a period
     period_s: float
     amplitude: float  # rms of the reference about its mean
-    saturated: int  # periods that were left out since the command was at its limit
+    left_out: LeftOut
 
     @property
     def realisations(self) -> int:
@@ -58,7 +83,7 @@ class Blocks:
 
 def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
     """Return the period of a reference in rows; None where it does not repeat."""
-    moving = reference - np.mean(reference)
+    moving = np.diff(reference)  # in which a bias that fades in is small
     size = float(np.ptp(reference))
     if not size:
         return None
@@ -102,37 +127,80 @@ def shorten(ticks: Ticks) -> Ticks:
     return ticks.take(np.concatenate(rows))
 
 
-def cut_periods(controller: Controller, ticks: Ticks) -> Blocks:
-    """Return the periods of a log. Raises LogError: its reference does not repeat, or too few periods are whole and
-    below the limit of the command.
+def say_left_out(left_out: LeftOut) -> list[str]:
+    """Return why periods are left out, and what to do about it."""
+    counts = (
+        (left_out.limit, "in {} of them the command is at its limit: lower the amplitude, or allow a larger limit"),
+        (left_out.gate, "in {} of them the gate did not believe a reading: look at its range and its largest step"),
+        (left_out.gap, "{} of them would lie beyond a gap, or have a number missing: log every tick"),
+    )
+    return [text.format(count) for count, text in counts if count]
+
+
+def _say_aperiodic(lasts_s: float, played: Played | None) -> str:
+    """Return why there is no period in a log, and how long to record."""
+    if played is not None and lasts_s < 2.0 * played.period_s:
+        few = "shorter than one period" if lasts_s < played.period_s else "shorter than two periods"
+        return (
+            f"it lasts {lasts_s:.3g} s, {few} of its stage's reference, of {played.period_s:.3g} s each; record all of "
+            f"that reference, {played.lasts_s:.4g} s, or at least the period that fades in and three after it, "
+            f"{4.0 * played.period_s:.3g} s"
+        )
+    return (
+        f"its reference does not repeat within half of its {lasts_s:.3g} s, so that the loop's response cannot be told "
+        "from noise: it has no period, or the log is shorter than two of them; play a periodic multisine as the "
+        "reference, and record at least 3 periods"
+    )
+
+
+def find_refused(controller: Controller, ticks: Ticks) -> Bool[np.ndarray, " n"]:
+    """Tell in which rows the gate of a law does not believe what it reads."""
+    gate, refused, state = controller.gate, np.zeros(len(ticks), dtype=bool), GateState()
+    if gate is None:
+        return refused
+    read, encoders = ticks.measured[:, 0], [ticks.further[:, controller.further.index(name)] for name in gate.reads]
+    for k, row in enumerate(zip(read.tolist(), *(each.tolist() for each in encoders), strict=True)):
+        _, state = gate.screen(state, row[0], row[1:])
+        refused[k] = state.held > 0
+    return refused
+
+
+def cut_periods(
+    controller: Controller,
+    ticks: Ticks,
+    refused: Bool[np.ndarray, " n"] | None = None,
+    played: Played | None = None,
+) -> Blocks:
+    """Return the periods of a log. `refused`: rows whose reading the law did not believe; `played`: the reference of
+    its stage, where one is known. Raises LogError: its reference does not repeat, or too few periods are whole, below
+    the limit of the command and believed.
     """
     period, seconds = find_period(ticks.reference), 1.0 / ticks.rate_hz
     if period is None:
-        raise LogError(
-            f"{ticks.source}: its reference does not repeat, so that the loop's response cannot be told from noise; "
-            "play a periodic multisine, of at least 3 periods, as the reference"
-        )
+        raise LogError(f"{ticks.source}: {_say_aperiodic(len(ticks) * seconds, played)}")
     stretches = _find_stretches(ticks.reference, period)
     starts = [  # first row, stretch
         (first + period * k, number) for number, (first, whole) in enumerate(stretches) for k in range(TRANSIENT, whole)
     ]
-    limit = AT_LIMIT * (controller.command_limit or np.inf)
-    free = [pair for pair in starts if np.max(np.abs(ticks.command[pair[0] : pair[0] + period])) < limit]
+    at_limit = np.abs(ticks.command) >= AT_LIMIT * (controller.command_limit or np.inf)
+    limited = [bool(np.any(at_limit[first : first + period])) for first, _ in starts]
+    gated = [refused is not None and bool(np.any(refused[first : first + period])) for first, _ in starts]
+    free = [pair for pair, *off in zip(starts, limited, gated, strict=True) if not any(off)]
+    both = sum(map(all, zip(limited, gated, strict=True)))
+    left_out = LeftOut(limit=sum(limited), gate=sum(gated) - both, gap=ticks.left_out // period)
     if len(free) < 2:
-        reached = len(starts) - len(free)
-        why = f"in {reached} of them the command is at its limit: lower the amplitude" if reached else "record more"
-        stays = float(np.mean(np.abs(ticks.command) >= limit))
-        if stays > STAYS:
+        why = join_words(say_left_out(left_out)) or "record more"
+        if (stays := float(np.mean(at_limit))) > STAYS:
             why = f"its command stays at the limit ({stays:.0%} of the ticks): check the signs of command and readings"
         raise LogError(
             f"{ticks.source}: it has {format_count(len(free), 'whole period')} of {period * seconds:.3g} s after the "
             f"first of each stretch; {why}, at least 3 periods are needed"
         )
-    return _transform(controller, ticks, period, free, len(starts) - len(free))
+    return _transform(controller, ticks, period, free, left_out)
 
 
 def _transform(
-    controller: Controller, ticks: Ticks, period: int, starts: Sequence[tuple[int, int]], saturated: int
+    controller: Controller, ticks: Ticks, period: int, starts: Sequence[tuple[int, int]], left_out: LeftOut
 ) -> Blocks:
     rows = np.array([first for first, _ in starts])[:, None] + np.arange(period)
     reference, command = (np.fft.rfft(part[rows], axis=1) for part in (ticks.reference, ticks.command))
@@ -152,7 +220,7 @@ def _transform(
         rows=period,
         period_s=period / ticks.rate_hz,
         amplitude=float(np.sqrt(0.5 * np.mean(np.sum(np.abs(scale * reference[:, lines]) ** 2, axis=1)))),
-        saturated=saturated,
+        left_out=left_out,
     )
 
 
@@ -184,5 +252,5 @@ def _join(group: Sequence[Blocks]) -> Blocks:
         beside={name: np.concatenate([part.beside[name] for part in group]) for name in sorted(names)},
         realisation=np.concatenate([part.realisation + at for part, at in zip(group, offsets, strict=True)]),
         amplitude=float(np.mean([part.amplitude for part in group])),
-        saturated=sum(part.saturated for part in group),
+        left_out=sum((part.left_out for part in group), LeftOut()),
     )

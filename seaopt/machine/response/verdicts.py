@@ -83,7 +83,8 @@ def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
         "periods": part.periods,
         "blocks": part.blocks,
         "phases": part.phases,
-        "saturated": part.saturated,
+        "saturated": part.left_out.limit,
+        "left_out": part.left_out,
         "frequency_hz": part.f,
         "loop_re": np.real(part.loop.value),
         "loop_im": np.imag(part.loop.value),
@@ -112,7 +113,7 @@ def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured
         blocks=len(rows.reference),
         phases=blocks.realisations,
         amplitude=blocks.amplitude,
-        saturated=blocks.saturated,
+        left_out=blocks.left_out,
     )
 
 
