@@ -308,7 +308,9 @@ class AcceptanceTable(StrictTable):
         default={},
     )
     time: Header | ClockTable | None = key("Column of the clock.", default=None)
-    rate_hz: Number | None = key("Ticks per second of a log without a clock.", default=None, gt=0, le=1e9)
+    rate_hz: Number | None = key(
+        "Ticks per second of a log without a clock, or with one that stamps them unevenly.", default=None, gt=0, le=1e9
+    )
 
 
 class FitTable(StrictTable):

@@ -9,6 +9,8 @@ from pathlib import Path
 from seaopt.errors import LogError
 from seaopt.logs import Column, Log, contents, read_log
 from seaopt.logs.formats import Field
+from seaopt.logs.quality.clock import JITTER_LIMIT, assess_clock
+from seaopt.logs.reading.selection import ClockError
 from seaopt.problem.bench_tables import ExperimentTable
 from seaopt.problem.columns import make_column
 from seaopt.problem.problem import Problem
@@ -51,7 +53,30 @@ def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], refere
     time = None if clock is None else make_column(clock, problem.folder)
     if time is not None and table.time is None and isinstance(time.column, str) and time.column not in fields:
         time = None  # another log's
-    return read_log(path, time=time, channels=channels, rate_hz=table.rate_hz)
+    return _read_ticks(path, time, channels, table.rate_hz)
+
+
+def _read_ticks(path: Path, time: Column | None, channels: Mapping[str, Column], rate_hz: float | None) -> Log:
+    """Return a log whose rows are the ticks of a law. `rate_hz`: of the ticks, where the log has no clock, or one that
+    stamps them unevenly.
+    """
+    try:
+        log = read_log(path, time=time, channels=channels)
+    except ClockError as error:
+        if rate_hz is not None and time is None:
+            return read_log(path, channels=channels, rate_hz=rate_hz)
+        raise LogError(f"{error}; in the problem file: [acceptance] time = COLUMN, or rate_hz = RATE") from error
+    if rate_hz is not None:
+        return log.restamp(rate_hz=rate_hz)
+    clock = assess_clock(log.time, log.source)
+    if clock.jitter_max > JITTER_LIMIT * clock.period:
+        rate_hz = float(f"{1.0 / clock.period:.3g}")
+        raise LogError(
+            f"{log.source}: a step of time differs by {clock.jitter_max / clock.period:.0%} from the period "
+            f"{clock.period:.4g} s ({JITTER_LIMIT:.0%} is allowed), though each row is a tick of the law; state the "
+            f"rate of the ticks in the problem file: [acceptance] rate_hz = {rate_hz:g}"
+        )
+    return log
 
 
 def _find_template(problem: Problem) -> ExperimentTable | None:

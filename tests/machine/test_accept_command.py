@@ -100,6 +100,38 @@ def test_columns_without_units_and_with_other_names_are_read(folder, accept):
     assert wrong.exit_code != 0 and "--reference COLUMN" in str(wrong.exception)
 
 
+@pytest.mark.parametrize("clock", ["jitter", "none"])
+def test_what_is_advised_of_an_uneven_clock_or_none_can_be_written_and_does(folder, clock, tmp_path):
+    """Each row is a tick, whenever it was stamped; one that is lost is a gap."""
+    from typer.testing import CliRunner
+
+    log = so.read_log(folder / "good.csv")
+    stamps = log.time + np.random.default_rng(1).uniform(-2e-4, 2e-4, len(log))
+    header, *rows = (folder / "good.csv").read_text().splitlines()
+    names, kept = header.split(","), np.delete(np.arange(len(log)), 5000)
+    at = names.index("time [s]")
+    cells = [row.split(",") for row in rows]
+    if clock == "jitter":
+        lines = [",".join([*cells[k][:at], f"{stamps[k]:.6f}", *cells[k][at + 1 :]]) for k in kept]
+    else:
+        header = ",".join([*names[:at], *names[at + 1 :]])
+        lines = [",".join([*row[:at], *row[at + 1 :]]) for row in cells]
+    (tmp_path / "log.csv").write_text("\n".join([header, *lines]) + "\n")
+
+    def accept(problem):
+        arguments = ["accept", str(problem), str(tmp_path / "log.csv"), "-o", str(folder / "out")]
+        return CliRunner().invoke(app, arguments)
+
+    refused = str(accept(folder / "stand.toml").exception)
+    assert "[acceptance]" in refused and "rate_hz = " in refused and "call log" not in refused
+    assert clock == "none" or "rate_hz = 1000" in refused
+    (folder / "even.toml").write_text(PROBLEM + "[acceptance]\nrate_hz = 1000\n")
+    done = accept(folder / "even.toml")
+    assert done.exit_code == 0, done.output
+    (row,) = json.loads((folder / "out" / "acceptance.json").read_text())["replay"]["logs"]
+    assert row["rate_hz"] == pytest.approx(1000.0) and row["ticks"] == (5000 if clock == "jitter" else len(log))
+
+
 def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
     done = accept(folder / "good.csv", folder / "half.csv")
     assert done.exit_code == 1 and "I is 0.5 times what it should be" in done.output
