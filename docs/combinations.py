@@ -105,11 +105,14 @@ PARTS: Mapping[str, Mapping[str, str]] = {
 DEFAULTS = {"PLANT": "stand", "MEASURED": '"tau_s"', "ROBUST_TO": "", "CERTIFIED": '"stand"', "COULOMB": "0", "ROBUSTNESS": "retune = 0"}
 HEAD = """# What goes with what
 
-Each law with each part, tried as a problem file by `python docs/combinations.py`, which writes this page from one run. A part works where the cell has a tick: with it the law is tuned (one of your
-own measured), certified, with steps of several sizes simulated on its models, and exported as C. Whether the certificate is met is another question: limits, draws and plants decide it. A number is
-the reason for which it is refused, below. A test refuses again what is refused here, and a slow one runs all of it.
-Of a law of your own, notch, prefilter and link feedforward of `[controller]` are not used: the law is what it is. A law that was designed on `frf:` has no model, on which it could be simulated, but
-with plants to certify on. A sweep is run, and nothing of it exported. The impedance has a number for its damping: `"critical"` is refused where something of the loop swings more slowly than the link.
+Each law (column) was tried with each part (row) by `python docs/combinations.py`, which writes this page from one run. A tick: the law was tuned (a law of your own: measured), certified, simulated with
+steps of several sizes and exported as C. Whether its certificate is met depends on limits, draws and plants. A number: it is refused, for the reason below the table. Tests refuse again what is refused
+here, and run the whole table.
+
+- A law of your own is what it is: notch, prefilter and link feedforward of `[controller]` are not used.
+- A law designed on `frf:` has no model. It is simulated on the plants that it is certified on.
+- A sweep is run, and nothing of it is exported.
+- The impedance has a number for its damping: `"critical"` is refused where something in the loop swings more slowly than the link.
 
 """
 
