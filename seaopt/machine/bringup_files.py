@@ -13,7 +13,6 @@ from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
 from seaopt.machine.bringup import Band, BringUp, Stage
-from seaopt.machine.stepped import Source
 
 PER_LINE = 8
 HEADER = """/* The reference of a stage of bring-up, made by seaopt: {phases} set(s) of phases, a period of
@@ -94,7 +93,7 @@ def write_stage(stage: Stage, folder: Path | str, *, tare: Tare | None = None) -
     header = HEADER.format(**words, bytes=4 * period * phases, rate=f"{1.0 / excitation.sample_time_s:.10g}")
     source = SOURCE.format(**words, waves=waves)
     return [
-        *_export(stage.source, folder, tare),
+        *_export(stage, folder, tare),
         write_json(folder / "controller.json", _describe(stage)),
         write_log(log, folder / "reference.csv"),
         write_text(folder / "reference.h", header),
@@ -104,10 +103,11 @@ def write_stage(stage: Stage, folder: Path | str, *, tare: Tare | None = None) -
     ]
 
 
-def _export(source: Source, folder: Path, tare: Tare | None) -> list[Path]:
+def _export(stage: Stage, folder: Path, tare: Tare | None) -> list[Path]:
+    source = stage.source
     if isinstance(source, ForceMPC):
         return [export_mpc(source, folder)]
-    return [*export(source, folder, allow_infeasible=True, log_rows=LOG_ROWS, tare=tare)]
+    return [*export(source, folder, allow_infeasible=True, log_rows=LOG_ROWS, tare=tare, stop=stage.stop)]
 
 
 def _describe(stage: Stage) -> dict[str, Any]:

@@ -24,6 +24,10 @@ ALWAYS = (
     "held grows, or status is the fault of the gate: the law has lost its reading.",
     "a tone is heard, or the command alternates from tick to tick: the loop is near its limit.",
 )
+BEGIN = (
+    "begin with force_law_init and force_law_reset of what is read at that moment, without which the first command is "
+    "a jump by what is read ({}/force_law_stage.c does all of it)"
+)
 NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
 
 
@@ -97,11 +101,12 @@ def _describe_stage(stage: Stage) -> Section:
     units = {controller.command.input: controller.command.unit, **outputs}
     source, code = stage.source, "force_mpc.c" if isinstance(stage.source, ForceMPC) else "force_law.c"
     held = f"Keep {source.over} at {format_number(stage.place)}." if isinstance(source, ScheduledController) else ""
+    begin = "begin with force_mpc_reset" if isinstance(source, ForceMPC) else BEGIN.format(stage.name)
     ring = "" if isinstance(source, ForceMPC) else f" ({stage.name}/force_law_log.c does)"
     sentences = [
         *([held] if held else []),
         *([f"{stage.note[0].upper()}{stage.note[1:]}."] if stage.note else []),
-        f"Flash {stage.name}/{code}, play {stage.name}/reference.csv (or reference.c): it fades in over "
+        f"Flash {stage.name}/{code}, {begin}, play {stage.name}/reference.csv (or reference.c): it fades in over "
         f"{format_number(period, 3)} s, then {format_count(len(excitation.waves), 'set')} of phases of "
         f"{excitation.periods} periods of {format_number(period, 3)} s, {f.size} lines from {format_number(f[0], 3)} "
         f"to {format_number(f[-1], 3)} Hz, then it fades out.",

@@ -30,7 +30,16 @@ from seaopt.control.deploy.c_text import (
     strip_markup,
 )
 from seaopt.control.deploy.schedule_export import SCHEDULE_TEMPLATES, describe_schedule, read_runnable
-from seaopt.control.deploy.target import LOG_TEMPLATES, TARE_TEMPLATES, Tare, describe_log, describe_tare, hash_law
+from seaopt.control.deploy.target import (
+    LOG_TEMPLATES,
+    STAGE_TEMPLATES,
+    TARE_TEMPLATES,
+    Tare,
+    describe_log,
+    describe_stops,
+    describe_tare,
+    hash_law,
+)
 from seaopt.control.laws.command import name_gain_units
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
@@ -73,6 +82,7 @@ def export(
     fit_met: bool | None = None,
     log_rows: int | None = None,
     tare: Tare | None = None,
+    stop: Mapping[str, float] | None = None,
 ) -> tuple[Path, ...]:
     """Write a controller as C99, with its gains as a C header and as a MATLAB script.
 
@@ -108,6 +118,9 @@ def export(
         (`seaopt.control.deploy.target`).
     tare : Tare, optional
         NAME_tare.h and NAME_tare.c average the zero of the force at rest.
+    stop : mapping of str to float, optional
+        With `log_rows`, of a stage of bring-up: NAME_stage.h and NAME_stage.c start the law from what is read, play the
+        reference.h beside them, log, and stop where a reading that is fed back is beyond these.
 
     Returns
     -------
@@ -188,6 +201,9 @@ def export(
         units, digest = _list_units(stored), hash_law(law, stored.outer)
         context |= describe_log(context, law, names, log_rows, units=units, digest=digest)
         templates |= LOG_TEMPLATES
+        if stop is not None:
+            context |= {"stops": describe_stops(stop, stored.signals, units, name_unit(stored.command))}
+            templates |= STAGE_TEMPLATES
     if tare is not None:
         require_type(tare, Tare, "tare", "give a Tare", ControlError)
         unit_after = strip_markup(f" {stored.command.reference_unit}")

@@ -22,6 +22,7 @@ from seaopt.records import record
 from seaopt.signals import REFERENCE, TARGET_LOG
 
 LOG_TEMPLATES = {"{}_log.h": "log.h.jinja", "{}_log.c": "log.c.jinja"}
+STAGE_TEMPLATES = {"{}_stage.h": "stage.h.jinja", "{}_stage.c": "stage.c.jinja"}
 TARE_TEMPLATES = {"{}_tare.h": "tare.h.jinja", "{}_tare.c": "tare.c.jinja"}
 LOG_ROWS, MOST_ROWS = 512, 1 << 20
 WIDTH = 80  # of a piece of the header in C
@@ -124,6 +125,25 @@ def describe_log(
         "header_bytes": len(text),
         "header_lines": [json.dumps(text[k : k + WIDTH]) for k in range(0, len(text), WIDTH)],
     }
+
+
+def describe_stops(
+    stop: Mapping[str, float], signals: Sequence[str], units: Mapping[str, str], suffix: str
+) -> list[dict[str, str]]:
+    """Return beyond what a stage stops by itself: of what is fed back, since where others have their zero is not known.
+    `signals`: what is fed back, the regulated one first.
+    """
+    symbols = [f"measurement_{suffix}", *(f"read_{identifier(name)}" for name in signals[1:])]
+    return [
+        {
+            "NAME": identifier(name).upper(),
+            "symbol": symbol,
+            "value": repr(float(stop[name])),
+            "unit": strip_markup(units.get(name, "-")),
+        }
+        for name, symbol in zip(signals, symbols, strict=True)
+        if name in stop
+    ]
 
 
 def describe_tare(tare: Tare, sample_time_s: float) -> dict[str, Any]:
