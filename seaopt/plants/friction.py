@@ -8,6 +8,10 @@ They have the names, roles and parameters of the plant they stand for, so that a
 A friction with bristles (LuGre's, a spring's hysteresis) is a spring where it sticks, of the stiffness sigma_0 beside
 the damping sigma_1. It may stick while others slide, as a spring does behind a motor that moves: each is looked at in
 either state, and those that are curves of the velocity together.
+
+A force that is a wave of a position (cogging) has any slope from -n a to n a at rest, by where the motor stands, which
+no model knows; over many waves it has none. Sliding it is left out; stuck it is a spring of n a, as in the well where
+the motor comes to rest. What it does on its crests, and to a motion of about a wave, only simulations show.
 """
 
 from __future__ import annotations
@@ -34,7 +38,7 @@ from seaopt.plants.plant import (
     name_symbols,
     state_space,
 )
-from seaopt.plants.roles import Bristles, Friction, change_ports, with_values
+from seaopt.plants.roles import Bristles, Friction, Reading, change_ports, with_values
 from seaopt.records import record
 from seaopt.signals import VectorN
 
@@ -44,6 +48,7 @@ STATES = (SLIDING, STUCK)
 SAMPLED_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-7, 1e3, 201)])
 SMOOTHED = 10.0  # times the speed of its smoothing a curve is what it smooths
 LOW_SPEED = 1.0  # m/s or rad/s: up to here a curve shows its dry friction
+LEAST_SIZE = 1e-15  # N or N m: of a wave
 FORGETTING = 1.0  # rad/s: by which bristles of a linear plant go back; nothing depends on them there
 
 
@@ -142,6 +147,30 @@ def friction_states(plant: Plant) -> Mapping[str, Plant]:
     return states
 
 
+@memo
+def leave_out_waves(plant: Plant) -> Plant:
+    """Return the plant without forces that are waves of a position, as one has it that moves over many of them."""
+    if not plant.followed:
+        return plant
+    return extend(plant, find_parameters=_flatten(plant), ports=change_ports(plant.ports, leave_out_waves))
+
+
+def _flatten(plant: Plant) -> Callable[[Any], Any]:
+    """Return what makes the sizes of a plant's waves zero among parameters."""
+    sizes = dict.fromkeys((size for reading in plant.followed.values() for size in reading.sizes), 0.0)
+    return lambda p: with_values(p, sizes) if sizes else p
+
+
+def _steepest_wave(reading: Reading, p: Any) -> Any:
+    """Return the steepest slope of a wave; its derivative by the sizes is zero where they are."""
+    return getattr(p, reading.wave) * ca.sqrt(sum(getattr(p, size) ** 2 for size in reading.sizes) + LEAST_SIZE**2)
+
+
+def _list_waves(plant: Plant, params: CompletedParameters) -> list[Reading]:
+    """Return the readings of a plant whose waves are there."""
+    return [reading for reading in plant.followed.values() if any(params[size].value for size in reading.sizes)]
+
+
 def split_friction(plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()) -> dict[str, Plant]:
     """Return the plants, one with friction in each of its states, as NAME sliding and NAME stuck (`name_states`)."""
     return {
@@ -230,13 +259,13 @@ def let_stick(plant: Plant) -> Plant:
 
 
 def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = ()) -> bool:
-    """Tell whether a plant's friction differs between sticking and sliding."""
+    """Tell whether a plant's friction, and the waves that hold it as friction does, differ from stuck to sliding."""
     if not plant.friction:
         return False
     values = plant.complete(params)
     flattest, steepest = friction_slopes(plant, values)
     holds = bool(np.any(flattest != steepest)) or any(find_bristle_stiffness(plant, values))
-    return holds or bool(_friction_parameters(plant) & set(varied))
+    return holds or bool(_list_waves(plant, values)) or bool(_friction_parameters(plant) & set(varied))
 
 
 def find_bristle_stiffness(plant: Plant, params: ParameterSet) -> list[float]:
@@ -273,6 +302,7 @@ def _friction_parameters(plant: Plant) -> frozenset[str]:
     bounds = [bound_slopes(friction, p) for friction in plant.friction.values()]
     spans = [ca.SX(steepest - flattest) for flattest, steepest in bounds]
     spans += [ca.SX(bristles.stiffness(p)) for bristles in _list_bristles(plant).values()]
+    spans += [ca.SX(_steepest_wave(reading, p)) for reading in plant.followed.values()]
     return frozenset(_list_parameters(plant, ca.vertcat(*spans)))
 
 
@@ -289,7 +319,7 @@ def _list_parameters(plant: Plant, expression: ca.SX) -> tuple[str, ...]:
 
 
 def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
-    """Return the plant with viscous friction in the place of each curve, and springs for bristles that stick."""
+    """Return the plant with viscous friction in the place of each curve, and springs for what holds where it sticks."""
     bristled = _list_bristles(plant)
 
     def choose_slope(name: str, friction: Friction, p: Any) -> Any:
@@ -298,10 +328,14 @@ def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
         return bristled[name].damping(p) if name in bristled else bound_slopes(friction, p)[1]
 
     def hold(x: Any, u: Any, p: Any) -> Any:
-        stuck = {name: bristles for name, bristles in bristled.items() if name in sticking}
-        return with_values(
-            u, {name: getattr(u, name) + each.stiffness(p) * each.coordinate(x, p) for name, each in stuck.items()}
-        )
+        forces = {name: getattr(u, name) for name in sticking}
+        for name in bristled.keys() & forces.keys():
+            forces[name] += bristled[name].stiffness(p) * bristled[name].coordinate(x, p)
+        for reading in plant.followed.values():
+            if reading.friction in forces:
+                forces[reading.friction] += _steepest_wave(reading, p) * getattr(x, reading.state)
+        readings = {name: getattr(x, reading.state) for name, reading in plant.followed.items()}
+        return with_values(u, {**forces, **readings})
 
     def forget(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         return {
@@ -312,9 +346,11 @@ def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
     return extend(
         plant,
         find_inputs=hold,
+        find_parameters=_flatten(plant),
         rates=forget,
         name=f"{plant.name} {state}",
         ports=change_ports(plant.ports, _choose_state, state),
+        followed={},
         friction={
             name: _take_viscous(friction, partial(choose_slope, name, friction))
             for name, friction in plant.friction.items()

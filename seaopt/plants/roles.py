@@ -74,11 +74,14 @@ class Sensing:
 @record
 class Reading:
     """A state whose place an estimation may give to what a sensor on it has read: the wave that is in f passes many
-    crests, which a simulated state that is off by one of them would take for one another.
+    crests, which a simulated state that is off by one of them would take for one another. A motor that moves over many
+    crests has no slope of it on average; one that rests may have any up to the steepest.
     """
 
     state: str
     wave: str  # parameter: the phase (rad) that one unit of the state makes
+    sizes: tuple[str, ...]  # parameters: of its sine and its cosine
+    friction: str  # the force that it adds to
 
 
 @record(eq=False)

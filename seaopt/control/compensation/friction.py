@@ -20,7 +20,14 @@ from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
-from seaopt.plants.friction import SAMPLED_SPEEDS, SLIDING, SMOOTHED, friction_matrices, friction_states
+from seaopt.plants.friction import (
+    SAMPLED_SPEEDS,
+    SLIDING,
+    SMOOTHED,
+    friction_matrices,
+    friction_states,
+    leave_out_waves,
+)
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.roles import Friction
 from seaopt.records import record
@@ -165,7 +172,7 @@ def find_velocity_per_rate(plant: Plant, params: ParameterSet, regulated: str, n
     locked = plant
     while locked.port is not None and locked.port.held is not None:
         locked = locked.port.held()
-    locked = leave_out_drift(freeze_heat(locked), regulated)
+    locked = leave_out_drift(freeze_heat(leave_out_waves(locked)), regulated)
     values = locked.complete(params)
     a, b, c, _ = state_space(friction_states(locked)[SLIDING], values)
     x, u = find_rest(locked, values)

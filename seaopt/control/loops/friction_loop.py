@@ -26,7 +26,14 @@ from seaopt.control.loops.sampled_plant import (
 from seaopt.control.systems.resolvent import Resolvent
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import SLIDING, find_bristle_stiffness, friction_matrices, friction_slopes, friction_states
+from seaopt.plants.friction import (
+    SLIDING,
+    find_bristle_stiffness,
+    friction_matrices,
+    friction_slopes,
+    friction_states,
+    leave_out_waves,
+)
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
@@ -113,7 +120,7 @@ def make_friction_loops(
     first) with what friction has above its flattest slope taken out; None without friction. `per_effort`: the command
     for one unit of the law's effort. `delay_samples`: whole samples from measurement to output, besides the hold.
     """
-    plant = leave_out_drift(freeze_heat(plant), measured)
+    plant = leave_out_drift(freeze_heat(leave_out_waves(plant)), measured)
     values = [plant.complete(params) for params in sets]
     spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
     remembers = [any(find_bristle_stiffness(plant, each)) for each in values]

@@ -17,6 +17,7 @@ from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
+from seaopt.plants.friction import leave_out_waves
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import share_drive
 from seaopt.records import record
@@ -129,7 +130,7 @@ def probe_of(plant: Plant) -> Plant:
             f"plant {plant.name} {missing}; use high_impedance, moving_output, "
             "two_link or rotary, or give ports = (Port(..., probe=...),)"
         )
-    return share_drive(freeze_heat(plant.port.probe()), plant)
+    return share_drive(freeze_heat(leave_out_waves(plant.port.probe())), plant)
 
 
 def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: float) -> PortModel:

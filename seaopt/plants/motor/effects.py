@@ -25,7 +25,8 @@ Parts of `seaopt.plants.parts`; each is nothing where its parameters are zero:
 ``cogging``
     A force on the motor that its position alone decides, :math:`a_g \sin(n_g \theta) + b_g \cos(n_g \theta)`, of
     magnets that meet slots, or of balls that meet a groove. Where a log has the position, a fit takes it from there: a
-    simulated one that is off by a wave has a minimum of its own. The phase is then that of the encoder's zero.
+    simulated one that is off by a wave has a minimum of its own. The phase is then that of the encoder's zero. Linear
+    loops see no slope of it where the motor slides, and a spring of the steepest where it is stuck.
 ``stand``
     What holds the spring gives, :math:`c_t` per unit of its effort, so that spring and stand are in series:
     :math:`k/(1 + k c_t)` is what a held link feels.
@@ -224,7 +225,7 @@ def let_cog(plant: Plant) -> Plant:
         phase = p.n_g * getattr(u, read)
         return with_values(u, {name: getattr(u, name) + p.a_g * ca.sin(phase) + p.b_g * ca.cos(phase)})
 
-    followed = {**plant.followed, read: Reading(state=position, wave="n_g")}
+    followed = {**plant.followed, read: Reading(state=position, wave="n_g", sizes=("a_g", "b_g"), friction=name)}
     parameters = _cogging_parameters(mechanics_of(friction.unit))
     return _change(plant, "cogging", parameters, push, let_cog, followed=followed)
 

@@ -23,6 +23,7 @@ from seaopt.estimation import Fit
 from seaopt.estimation.result.covariance import take_root
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import PARTS, Mode, Plant, state_space
+from seaopt.plants.friction import leave_out_waves
 from seaopt.records import record
 from seaopt.units import factor
 
@@ -363,6 +364,7 @@ def _mode(plant: Plant) -> Mode:
 
 def _tabulate_mode(plant: Plant, nominal: ParameterSet, wanted: tuple[float, float]) -> ModeMap:
     """Tabulate where the values of one parameter put a plant's mode."""
+    plant = leave_out_waves(plant)
     mode, complete = _mode(plant), plant.complete(nominal)
     values = complete[mode.parameter].value * np.geomspace(20.0, 0.05, 400)
     place = list(plant.states).index(mode.state)
