@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control import ForceMPC, ScheduledController
+from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup import Band, BringUp, Stage
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
@@ -16,6 +16,7 @@ from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.kinds.controller import say_bandwidths, show_stuck_bandwidth
 from seaopt.units import unit_after
 
 PARTS = {"stages": "Stages", "provenance": "Provenance"}
@@ -27,6 +28,10 @@ ALWAYS = (
 BEGIN = (
     "begin with force_law_init and force_law_reset of what is read at that moment, without which the first command is "
     "a jump by what is read ({}/force_law_stage.c does all of it)"
+)
+TWO_BANDWIDTHS = (
+    "Dry friction makes two bandwidths, of the full law {}: the first where the motor slides, the second in motions so "
+    "small that it sticks; what is played lies between."
 )
 NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
 
@@ -55,7 +60,9 @@ def summarise(result: BringUp) -> list[KeyFigure]:
     """Return the bandwidth of each stage."""
     return [
         KeyFigure(
-            name=stage.name, value=f"{format_number(stage.controller.spec.bandwidth_hz, 3)} Hz", against=stage.note
+            name=stage.name,
+            value=say_bandwidths(stage.controller, stage.controller.spec.bandwidth_hz),
+            against=stage.note,
         )
         for stage in result.stages
     ]
@@ -64,16 +71,22 @@ def summarise(result: BringUp) -> list[KeyFigure]:
 def describe(result: BringUp) -> list[Section]:
     """Return a table of the stages, then each with what to play, to log, to expect, and when to stop."""
     rows = tuple(_list_row(stage) for stage in result.stages)
-    head = ("stage", "law", "bandwidth (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
+    head = ("stage", "law", "bandwidth (Hz)", "stuck (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
     last = result.stages[-1].controller
     outer = () if last.outer is None else (OUTER.format(PLACE if last.renders else FORCE),)
     overview = Section(
         title="Stages",
         part="stages",
-        tables=(Table(head=head, rows=rows, align="<<>>>>>"),),
-        remarks=(*(f"Stop a stage when {text}" for text in ALWAYS), NEXT, *outer),
+        tables=(Table(head=head, rows=rows, align="<<>>>>>>"),),
+        remarks=(*_explain_bandwidths(last), *(f"Stop a stage when {text}" for text in ALWAYS), NEXT, *outer),
     )
     return [overview, *(_describe_stage(stage) for stage in result.stages)]
+
+
+def _explain_bandwidths(controller: Controller) -> tuple[str, ...]:
+    """Return which bandwidth is which, where friction makes two."""
+    stuck = show_stuck_bandwidth(controller)
+    return (TWO_BANDWIDTHS.format(say_bandwidths(controller, controller.spec.bandwidth_hz)),) if stuck else ()
 
 
 def _list_row(stage: Stage) -> tuple[Any, ...]:
@@ -84,6 +97,7 @@ def _list_row(stage: Stage) -> tuple[Any, ...]:
         stage.name,
         mark_met(stage.certificate.met, "certified", "not certified"),
         format_number(controller.spec.bandwidth_hz, 3),
+        show_stuck_bandwidth(controller),
         "none" if limit is None else controller.command.show(limit),
         f"{format_number(excitation.bias, 3)} ± {format_number(excitation.amplitude, 3)}{unit}",
         format_number(excitation.reference.size * excitation.sample_time_s, 3),

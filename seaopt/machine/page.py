@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from seaopt.reporting.sections.data import (
     Verdict,
     mark_met,
 )
+from seaopt.reporting.sections.kinds.controller import say_bandwidths, show_stuck_bandwidth
 from seaopt.units import unit_after
 
 PARTS = {
@@ -243,13 +244,13 @@ def describe(result: Acceptance) -> list[Section]:
         told = f"The schedule is judged where {over} stood: {format_number(value)}{unit_after(unit)}."
         sections[0] = replace(sections[0], sentences=(told,))
     if result.response is not None:
-        sections.append(_describe_response(result.response, result.left_out))
+        sections.append(_describe_response(result, result.response))
     if result.differences is not None:
         sections.append(_describe_differences(result.differences))
     return sections
 
 
-def _describe_response(response: Response, left_out: Mapping[str, str]) -> Section:
+def _describe_response(result: Acceptance, response: Response) -> Section:
     rows = tuple(
         (
             row.name,
@@ -271,11 +272,14 @@ def _describe_response(response: Response, left_out: Mapping[str, str]) -> Secti
         "Nothing is said between the lines and beyond them.",
         STABILITY,
     ]
+    if show_stuck_bandwidth(result.controller):
+        both = say_bandwidths(result.controller, result.controller.achieved.bandwidth_hz)
+        remarks.append(f"Predicted is the actuator as it slides; its bandwidth is {both}.")
     if response.at_amplitude_only:
         remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
     if any(row.outcome == "undecided" for row in response.judged if row.limit is not None):
         remarks.append(f"Undecided is no doubt about the machine: the log does not decide {_say_undecided(response)}.")
-    remarks += [f"Left out: {text}" for text in left_out.values()]
+    remarks += [f"Left out: {text}" for text in result.left_out.values()]
     items = tuple(_warn_left_out(part) for part in response.measured if part.left_out.total)
     tables = (Table(head=head, rows=rows, align="<<>>>>>>", optional=("periods needed",)),)
     return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks), items=items)

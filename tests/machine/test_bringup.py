@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.formatting import format_number
 from seaopt.machine.bringup_files import write_bring_up
 from tests.machine.simulator import Bench, Machine
 
@@ -103,6 +104,35 @@ def test_where_no_slower_law_is_certified_it_is_the_same_with_less_effort(contro
     assert kept == [each.name for each in plan.stages]
     assert stage.controller.command_limit == 2.25 and "effort" in stage.note
     assert np.array_equal(stage.controller.law.a, controller.law.a)
+
+
+def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(tmp_path):
+    """The stuck plant is that of the equations: a motor that does not move behind its spring, but for v_s."""
+    from seaopt.machine.bringup_page import write_bring_up_page
+    from seaopt.reporting import write_report
+
+    values = so.plants.thor().update(f_c=60.0, v_s=5e-3)
+    law = so.tune(so.plants.high_impedance(), values, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
+    f = np.geomspace(0.1, 100.0, 4000)
+    r = values["l"].value / (2.0 * np.pi * values["N_p"].value)
+    mass, k = values["m_l"].value + values["J"].value / r**2, values["k"].value
+    s = 2j * np.pi * f
+    damping = values["b_r"].value / r**2 + 60.0 / 5e-3
+    plant = k / (mass * s**2 + damping * s + k) * np.exp(-s * 1.5e-3)  # a hold of a sample, and one of delay
+    forward, feedback = law.law.responses(f)
+    tracking = np.abs(forward * plant / (1.0 - feedback * plant))
+    stuck = f[np.flatnonzero(tracking < np.sqrt(0.5) * tracking[0])[0]]
+    said = format_number(law.measure_states()[" stuck"].bandwidth_hz, 3)
+    assert float(said) == pytest.approx(stuck, rel=0.03) and float(said) < 0.7 * 30.0
+    plan = so.bring_up(
+        law, {"stand": so.plants.high_impedance()}, values, samples=5, fractions=(), limits={"F1": 600.0}
+    )
+    both = f"30 Hz sliding and {said} Hz stuck"
+    page = write_bring_up_page(plan, tmp_path / "bringup.html").read_text()
+    report = write_report([law], tmp_path / "report.html").read_text()
+    for text in (repr(law), repr(plan), page, report):
+        assert both in " ".join(text.split())
+    assert "bandwidth, stuck" in repr(law) and "bandwidth, sliding" in repr(law)
 
 
 def test_what_cannot_be_played_is_refused(controller):

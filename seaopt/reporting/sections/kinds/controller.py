@@ -20,7 +20,7 @@ SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another on
 def judge(controller: Controller, commands: Commands) -> Verdict:
     """Return the verdict on a controller; `sweep` is the command that tunes at a range of bandwidths, if there is."""
     spec = controller.spec
-    name = f"Controller: {controller.structure} on {spec.regulated}, {_name_bandwidths(controller)}"
+    name = f"Controller: {controller.structure} on {spec.regulated}, {say_bandwidths(controller, spec.bandwidth_hz)}"
     if controller.met:
         on = " on measured points" if controller.design is None else ""
         return Verdict(met=True, text=f"{name}, every limit met{on}")
@@ -34,15 +34,18 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
     )
 
 
-def _name_bandwidths(controller: Controller) -> str:
-    """Return the bandwidth asked, and where friction makes two of it the one that is left while it sticks."""
-    asked, stuck = f"{controller.spec.bandwidth_hz:g} Hz", _measure_stuck(controller)
-    if not stuck:
-        return asked
-    return f"{asked} sliding and {format_number(stuck[0][1].bandwidth_hz, missing='none')} Hz stuck"
+def say_bandwidths(controller: Controller, bandwidth_hz: float | None) -> str:
+    """Return a bandwidth; where friction makes two of it, with the one that is left while it sticks."""
+    moving, stuck = format_figure(bandwidth_hz, "Hz", missing="none"), show_stuck_bandwidth(controller)
+    return f"{moving} sliding and {stuck} Hz stuck" if stuck else moving
 
 
-@lru_cache(maxsize=1)  # verdict and sections of a controller are written one after the other
+def show_stuck_bandwidth(controller: Controller) -> str:
+    """Return the bandwidth that is left while friction sticks, in Hz; nothing without friction."""
+    return next((format_number(row.bandwidth_hz, 3, "no") for _, row in _measure_stuck(controller)), "")
+
+
+@lru_cache(maxsize=4)  # verdict and sections of a controller are written one after the other
 def _measure_stuck(controller: Controller) -> list[tuple[str, LoopFigures]]:
     """Return the figures of the design plant where its friction sticks, by state; none without friction."""
     return [] if controller.design is None else [*controller.measure_states().items()][1:]
@@ -81,7 +84,7 @@ def summarise(controller: Controller) -> list[KeyFigure]:
     ms, gain_unit = spec.level("max_sensitivity"), controller.command.gain_unit
     asked, allowed = f"asked {spec.bandwidth_hz:g} Hz", "" if ms is None else f"at most {ms:g}"
     return [
-        KeyFigure(name="bandwidth", value=format_figure(achieved.bandwidth_hz, "Hz", 3), against=asked),
+        KeyFigure(name="bandwidth", value=say_bandwidths(controller, achieved.bandwidth_hz), against=asked),
         KeyFigure(name="Ms", value=format_number(achieved.ms, 3), against=allowed),
         KeyFigure(name="phase margin", value=format_figure(achieved.phase_margin_deg, "deg", 3), against=on),
         KeyFigure(name="noise gain", value=format_figure(achieved.noise_gain, gain_unit, 3), against=on),
@@ -122,10 +125,15 @@ def describe(controller: Controller) -> list[Section]:
 def list_achieved(controller: Controller) -> list[tuple[str, str, str]]:
     """Return the figures of the design plant: what each is, what was achieved, what was asked."""
     a = controller.achieved
-    rows = [
-        (row.limit.label, format_figure(row.value, row.unit), row.allowed_text)
-        for row in list_design_figures(controller.spec, controller.design_loop)
-    ]
+    rows, stuck = list[tuple[str, str, str]](), _measure_stuck(controller)
+    for row in list_design_figures(controller.spec, controller.design_loop):
+        two = row.limit.name == "bandwidth_hz" and stuck
+        label = f"{row.limit.label}, sliding" if two else row.limit.label
+        rows.append((label, format_figure(row.value, row.unit), row.allowed_text))
+        if two:
+            rows += [
+                (f"{row.limit.label},{state}", format_figure(each.bandwidth_hz, "Hz"), "") for state, each in stuck
+            ]
     if controller.prefilter is not None:
         rows.append(("bandwidth without prefilter", format_figure(controller.bandwidth_without_prefilter_hz, "Hz"), ""))
     return [
