@@ -234,4 +234,4 @@ def without_drawing(monkeypatch):
 
     monkeypatch.setattr("seaopt.reporting.drawing.render_figure", lambda figure, kind: b"<svg></svg>")
     monkeypatch.setattr("seaopt.reporting.page.report.make_chart", leave_empty)
-    monkeypatch.setattr("seaopt.reporting.page.report.compose_sheet", lambda panels: SimpleNamespace(axes=()))
+    monkeypatch.setattr("seaopt.reporting.page.report.compose_sheet", lambda panels, **_: SimpleNamespace(axes=()))

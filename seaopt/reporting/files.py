@@ -49,7 +49,7 @@ def write_frequency_figure(
     FileError
         The folder cannot be written.
     """
-    return write_figure(compose_sheet(survey_panels(surveys, given, fitted)), path)
+    return write_figure(compose_sheet(survey_panels(surveys, given, fitted), final=True), path)
 
 
 def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
@@ -67,7 +67,7 @@ def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
     list of Path
         Both files.
     """
-    return write_figure(compose_sheet(frontier_panels(frontier), FRONTIER_COLUMNS), path)
+    return write_figure(compose_sheet(frontier_panels(frontier), FRONTIER_COLUMNS, final=True), path)
 
 
 def write_quality_figure(data: Log | Table, quality: Quality, path: Path | str) -> list[Path]:
@@ -92,4 +92,4 @@ def write_quality_figure(data: Log | Table, quality: Quality, path: Path | str) 
     FileError
         The folder cannot be written.
     """
-    return write_figure(compose_sheet(log_panels(data, quality)), path)
+    return write_figure(compose_sheet(log_panels(data, quality), final=True), path)

@@ -43,7 +43,8 @@ def make_figures(draw):
     """Return the same figure twice, the second with its ticks replaced."""
     panel = Panel(name="one", title="one", draw=draw, **LABELS.get(draw, {}))
     plain, finished = (
-        draw_panel(panel, add_axes(PlainFigure(figsize=(5.0, 4.0)), panel.heights, 0.8)) for _ in range(2)
+        draw_panel(panel, add_axes(PlainFigure(figsize=(5.0, 4.0)), panel.heights, 0.8, final=final))
+        for final in (False, True)
     )
     plain, finished = (each.get_figure(root=True) if isinstance(each, Axes) else each for each in (plain, finished))
     simplify_ticks(finished.axes)

@@ -20,6 +20,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from seaopt.formatting import printable
 from seaopt.reporting.drawing import TEXT_AS_TEXT, render_figure
 from seaopt.reporting.figures.panel import GRID
+from seaopt.reporting.figures.ticks import FinalAxes
 
 WIDTH, HEIGHT = 4.9, 2.5  # inches, of one panel with one axis
 TOP, BARE_TOP, BOTTOM, RIGHT, BETWEEN = 0.34, 0.12, 0.48, 0.16, 0.12  # inches, margins of a panel
@@ -72,21 +73,23 @@ def add_axes(
     *,
     corner: tuple[float, float] = (0.0, 0.0),
     title: bool = True,
+    final: bool = False,
 ) -> tuple[Axes, ...]:
     """Return axes one above the other, which share x, with this package's grid. Margins are the same on every panel:
     axes stand in line on a sheet, and nothing has to be measured. `heights`: from the top, in heights of a panel,
     margins included. `left`: inches for the tick labels and the label of y. `corner`: inches from the figure's left and
-    top edges to the panel's. `title`: leave room for one.
+    top edges to the panel's. `title`: leave room for one. `final`: `simplify_ticks` will replace their ticks.
     """
     width, height = figure.get_size_inches()
     top = TOP if title else BARE_TOP
     room = HEIGHT * sum(heights) - top - BOTTOM - BETWEEN * (len(heights) - 1)
     above, axes = corner[1] + top, list[Axes]()
+    kind = FinalAxes if final else PlainAxes
     for share in heights:
         tall = room * share / sum(heights)
         box = np.array([corner[0] + left, height - above - tall, WIDTH - left - RIGHT, tall])
         box /= (width, height, width, height)
-        axes.append(figure.add_axes(tuple(box), axes_class=PlainAxes, sharex=axes[0] if axes else None))
+        axes.append(figure.add_axes(tuple(box), axes_class=kind, sharex=axes[0] if axes else None))
         above += tall + BETWEEN
     for axis in axes:
         axis.grid(visible=True, color=GRID, linewidth=0.6)
@@ -150,6 +153,8 @@ def place_legend(axis: Axes, draw: Callable[..., Legend]) -> None:
         row, column = np.unravel_index(np.lexsort((away.ravel(), hidden.ravel()))[0], hidden.shape)
         x, y = (float(cell + CLEAR) * CELL for cell in (column, row))
         places.append((int(hidden[row, column]), columns, (x / axis.bbox.width, y / axis.bbox.height)))
+        if not places[-1][0]:  # nothing is hidden: more columns cannot be better
+            break
     _, columns, place = min(places, default=(0, 1, "best"))
     draw(ncols=columns, loc=place)
 

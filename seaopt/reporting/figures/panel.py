@@ -92,7 +92,7 @@ def draw_panel(panel: Panel, ax: Axes | Sequence[Axes] | None = None, *, bare: b
     count = len(panel.heights)
     if ax is None:
         figure = PlainFigure(figsize=(WIDTH, HEIGHT * sum(panel.heights)))
-        axes = add_axes(figure, panel.heights, panel.left, title=not bare)
+        axes = add_axes(figure, panel.heights, panel.left, title=not bare, final=bare)
     else:
         axes = tuple(ax) if isinstance(ax, Iterable) else (ax,)
     if len(axes) != count or not all(isinstance(axis, Axes) for axis in axes):
@@ -102,8 +102,8 @@ def draw_panel(panel: Panel, ax: Axes | Sequence[Axes] | None = None, *, bare: b
     return axes[0] if count == 1 else axes[0].get_figure(root=True)
 
 
-def compose_sheet(panels: Sequence[Panel], columns: int = SHEET_COLUMNS) -> PlainFigure:
-    """Draw panels on one figure, row by row, each as high as the highest of its row."""
+def compose_sheet(panels: Sequence[Panel], columns: int = SHEET_COLUMNS, *, final: bool = False) -> PlainFigure:
+    """Draw panels on one figure, row by row, each as high as the highest of its row; a final one is to be written."""
     from seaopt.reporting.figures.canvas import HEIGHT, WIDTH, PlainFigure, add_axes
 
     columns = min(columns, len(panels))
@@ -113,5 +113,5 @@ def compose_sheet(panels: Sequence[Panel], columns: int = SHEET_COLUMNS) -> Plai
     for number, row in enumerate(rows):
         for column, panel in enumerate(row):
             corner = (WIDTH * column, HEIGHT * sum(tall[:number]))
-            fill_panel(panel, add_axes(figure, panel.heights, panel.left, corner=corner))
+            fill_panel(panel, add_axes(figure, panel.heights, panel.left, corner=corner, final=final))
     return figure

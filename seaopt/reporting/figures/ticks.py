@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
+from matplotlib.axes import Axes
+from matplotlib.axis import Tick, XAxis, YAxis
 from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
 from matplotlib.markers import TICKDOWN, TICKLEFT
@@ -23,9 +25,6 @@ from matplotlib.transforms import offset_copy
 
 from seaopt.records import record
 from seaopt.signals import VectorM, VectorN
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 GAP = 3.5  # points between a mark and its number, as matplotlib has it
 MARK_WIDTH, MINOR_LENGTH, MINOR_WIDTH = 0.8, 2.0, 0.6  # points, likewise
@@ -57,6 +56,37 @@ class Side:
         """Add one line to the axes, below curves."""
         points = (along, across) if self.name == "x" else (across, along)
         self.axes.add_artist(Line2D(*points, transform=self.transform, zorder=DEPTH, **look))
+
+
+class _Bare:
+    """A side without the two ticks that matplotlib makes with it, for their look: a tenth of drawing a report."""
+
+    def reset_ticks(self) -> None:
+        """Begin with none."""
+        self.majorTicks, self.minorTicks = list[Tick](), list[Tick]()
+
+
+class _XAxis(_Bare, XAxis):
+    pass
+
+
+class _YAxis(_Bare, YAxis):
+    pass
+
+
+class FinalAxes(Axes):
+    """Axes whose ticks `simplify_ticks` replaces before they are drawn."""
+
+    def _init_axis(self) -> None:  # what matplotlib's own projections override
+        self.xaxis, self.yaxis = _XAxis(self, clear=False), _YAxis(self, clear=False)
+        for name, spine in self.spines.items():
+            spine.register_axis(self.xaxis if name in ("top", "bottom") else self.yaxis)
+
+    def clear(self) -> None:
+        """Do as `Axes.clear`."""
+        super().clear()
+        for spine in self.spines.values():
+            spine.set_position(("outward", 0.0))  # the default, which else a tick brings about
 
 
 def simplify_ticks(axes: Iterable[Axes]) -> None:

@@ -181,7 +181,7 @@ def write_report(
     figures: list[Path] = []
     for plate in count_off(plates, "figure", progress):
         if plate.part in FILED:
-            figures += write_figure(compose_sheet(plate.panels), target.parent / "figures" / plate.name)
+            figures += write_figure(compose_sheet(plate.panels, final=True), target.parent / "figures" / plate.name)
         charts = [make_chart(panel) for panel in plate.panels]
         drawn.setdefault(plate.part, []).append({"heading": plate.heading, "text": plate.text, "charts": charts})
     page = write_text(target, _render(material, drawn, title, files, command, expectations))
