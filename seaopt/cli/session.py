@@ -25,7 +25,7 @@ from seaopt.control.laws.stored import CONTROLLER_SCHEMA
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.errors import ProblemError, SeaoptError
-from seaopt.estimation import Experiment, Fit, compare_with_log, warn_unidentified
+from seaopt.estimation import Experiment, Fit, ModelledOutputs, compare_with_log, warn_unidentified
 from seaopt.estimation.fit import SCALED
 from seaopt.estimation.result.findings import state_guesses
 from seaopt.estimation.result.fit_result import FIT_SCHEMA
@@ -292,7 +292,8 @@ class Session:
         if stage not in ("fit", "frf"):
             content = content | {"fit_met": self.fit_met(), "guessed": self.problem.table.guessed}
         made_from = digest_sources(self.problem, stage, self.folder)
-        self.written.append(write_json(self._path(stage), content | {"made_from": made_from}))
+        path = write_json(self._path(stage), content | {"made_from": made_from})
+        self.written = [*(each for each in self.written if each != path), path]
 
     def _read(self, stage: str) -> dict[str, Any]:
         """Read an earlier stage's result; one that was edited, or made from something else than is there, is refused. A
@@ -330,17 +331,24 @@ class Session:
     def _fit(self, tell: Progress) -> None:
         reading, fitting, again = divide(tell, READING, 1.0 - READING, 1.0 if self.explain else 0.0)
         reading("reading logs", 0.0)
-        result = fit_problem(self.problem, self.experiments(), progress=fitting)
-        (self.folder / EXPLAINED).unlink(missing_ok=True)  # of another fit
+        result = fit_problem(self.problem, self.experiments(), keep=self._keep_fit, progress=fitting)
         if self.explain:
             found = find_explanation(result)
             if found is None:
                 self.say(say_unexplained(result.hypotheses))
             else:
+                self._keep_fit(result)
                 result = self._explain(found, result, again)
+        self.results["scores"] = self._keep_fit(result)
+
+    def _keep_fit(self, result: Fit) -> list[ModelledOutputs]:
+        """Write a fit that stands, judged or not, in place of the one before; return its scores of other logs."""
+        lines, scores = self.folder / EXPLAINED, score_problem(self.problem, result, self.experiments())
+        if lines not in self.written:
+            lines.unlink(missing_ok=True)  # of another fit
         self.results["fit"] = result
-        self.results["scores"] = scores = score_problem(self.problem, result, self.experiments())
         self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})
+        return scores
 
     def _explain(self, found: HypothesisTrial, before: Fit, tell: Progress) -> Fit:
         """Return the fit of the problem with what explains its logs, which is the problem from here on."""
@@ -352,7 +360,7 @@ class Session:
         self.say(
             f"{say_adopted(found)}; fitting again with the lines in {place}, which belong into {self.problem.source}"
         )
-        result = fit_problem(self.problem, self.experiments(), progress=tell)
+        result = fit_problem(self.problem, self.experiments(), keep=self._keep_fit, progress=tell)
         return replace(result, hypotheses=(*before.hypotheses, *result.hypotheses))
 
     def validate(self, log: Path, like: str | None, as_json: bool, amount: Amount = "usual") -> bool:

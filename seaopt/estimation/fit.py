@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from seaopt.estimation.problem.experiment import Experiment, check_shots, is_con
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS, FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem, count_evaluations, pose_problem
 from seaopt.estimation.problem.losses import Huber, Loss, SoftL1, Squares
-from seaopt.estimation.result.findings import find_guesses, find_sharp_friction, order_findings
+from seaopt.estimation.result.findings import find_guesses, find_sharp_friction, find_unjudged, order_findings
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.delay_cells import search_delays
@@ -56,6 +56,7 @@ def fit(
     diagnostics: bool = True,
     alternatives: Sequence[Plant] = (),
     validation: Sequence[Experiment] = (),
+    keep: Callable[[Fit], object] | None = None,
     progress: Progress = ignore,
 ) -> Fit:
     """Fit the free parameters of `params` to one or several experiments that share them.
@@ -82,6 +83,8 @@ def fit(
         Other plants that may have been on the bench: where a log is not explained, they are tried.
     validation : sequence of Experiment
         Logs that are not fitted: each is refitted alone, and what its values differ by is in the model's std.
+    keep : callable, optional
+        Called with the fit before it is judged, which may take several times as long as its search; it is not met.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`): each iteration, each
         cause that is tried; and without a share where the search could be quicker.
@@ -142,6 +145,8 @@ def fit(
         )
         evaluations = count_evaluations() - before
         result = summarise(solved, chosen, diagnostics, started)
+        if keep is not None:
+            keep(replace(result, findings=order_findings((*result.findings, find_unjudged()))))
         if diagnostics:
             judged = judge(result, alternatives, judging, validation, evaluations=evaluations)
             result = _name_guesses(judged, named, params)

@@ -55,7 +55,11 @@ ROUNDS = 3  # of tuning and certifying, where a first look at the draws finds on
 
 
 def fit_problem(
-    problem: Problem, experiments: Sequence[Experiment] | None = None, *, progress: Progress = ignore
+    problem: Problem,
+    experiments: Sequence[Experiment] | None = None,
+    *,
+    keep: Callable[[Fit], object] | None = None,
+    progress: Progress = ignore,
 ) -> Fit:
     """Fit the problem's logs, as `seaopt fit` does.
 
@@ -65,7 +69,7 @@ def fit_problem(
         What `read_problem` returned.
     experiments : sequence of Experiment, optional
         All of the problem's, where they are read already; read here if left out.
-    progress : callable, optional
+    keep, progress : callable, optional
         As in `seaopt.fit`.
 
     Raises
@@ -82,6 +86,7 @@ def fit_problem(
     result = fit(
         fitted,
         problem.parameters,
+        keep=keep,
         progress=progress,
         alternatives=tuple(problem.plants.values()),
         validation=[experiment for experiment in every if experiment not in fitted],

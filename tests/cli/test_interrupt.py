@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -49,3 +50,55 @@ def test_ctrl_c_is_one_line_and_exits_130(tmp_path, monkeypatch, capsys, design)
     assert leaving.value.code == 130
     told = capsys.readouterr().err.strip().splitlines()
     assert told[-1] == f"seaopt: interrupted; what was finished is in {tmp_path / 'out'}"
+
+
+BENCH = """
+schema = 1
+[parameters]
+J = { value = 3e-6, free = true, min = 1e-8, max = 1e-4 }
+[plant.stand]
+kind = "high_impedance"
+[[experiment]]
+name = "lines"
+plant = "stand"
+[experiment.virtual]
+seed = 1
+duration_s = 2
+rate_hz = 400
+noise_std = { F1 = 2.0 }
+truth = { J = 3.31e-6 }
+excitation = { multisine = { amplitudes = [1.0, 1.0], frequencies_hz = [5.0, 15.0] } }
+[controller]
+plant = "stand"
+measured = "F1"
+bandwidth_hz = 30
+"""
+KILLED = """
+import os, signal, sys
+import seaopt.estimation
+from seaopt.cli import main
+fit = sys.modules["seaopt.estimation.fit"]
+fit.judge = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)
+main()
+"""
+
+
+def test_a_fit_that_is_killed_as_it_is_judged_is_there_and_nobody_takes_it_for_met(tmp_path):
+    """Until then its values are those of a run that ends: the plant's own, within its std."""
+    problem, out = tmp_path / "problem.toml", tmp_path / "out"
+    problem.write_text(BENCH, encoding="utf-8")
+    arguments = [sys.executable, "-c", KILLED, "fit", str(problem), "-o", str(out)]
+    assert subprocess.run(arguments, capture_output=True, check=False).returncode == -signal.SIGKILL
+    assert [path.name for path in out.iterdir()] == ["fit.json"]
+    content = json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    (error,) = (row for row in content["findings"] if row["severity"] == "error")
+    assert content["met"] is False and error["kind"] == "unjudged" and content["status"] == "converged"
+    inertia = content["parameters"]["J"]
+    assert abs(inertia["value"] - 3.31e-6) < 5.0 * inertia["std"] < 0.02 * 3.31e-6
+    session = Session(problem, out)
+    session.run("tune")
+    assert not session.met(["tune"]) and "it is not judged" in session.parameters().verdict
+    assert json.loads((out / "controller.json").read_text(encoding="utf-8"))["fit_met"] is False
+    whole = Session(problem, out)
+    whole.run("fit")
+    assert whole.met(["fit"]) and whole.results["fit"].parameters["J"].value == inertia["value"]

@@ -32,7 +32,7 @@ class FitFinding:
 
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
     # for programs: "bound", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out", "noise",
-    # "range", "residual", "rough", "samples", "sharp", "starts", "step"
+    # "range", "residual", "rough", "samples", "sharp", "starts", "step", "unjudged"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy
@@ -102,6 +102,16 @@ def find_sharp_friction(experiment: str) -> FitFinding:
         where=experiment,
         text="its friction is smoothed too sharply to be simulated in time, and was fitted as it jumps at rest; write "
         "sticks = true (so.plants.let_stick), or give a larger smoothing speed",
+    )
+
+
+def find_unjudged() -> FitFinding:
+    """Return the error of a fit whose judgement has not ended: nobody is to take it for met."""
+    return FitFinding(
+        severity="error",
+        kind="unjudged",
+        where="",
+        text="it is not judged: what it leaves was still looked into as it was written; let the fit run to its end",
     )
 
 
