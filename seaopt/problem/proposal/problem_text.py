@@ -59,13 +59,13 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
     for log in logs:
         name = next(name for name in _number_names(log.name) if name not in names)
         names.add(name)
-        keys = [_describe_delay(log)]
+        keys = [_describe_delay(log, logs)]
         if log is not logs[0]:
             keys.append('# use = "validate"  # keeps this log out of the fit, which is then scored on it')
         head_rows, channels = _describe_experiment(log, name, interview), _describe_channels(log, actuator, interview)
         lines += ["", *_write_experiment(head_rows, keys, channels)]
         if any(log is each for each in single):
-            lines += _offer_second_log(log, name, head_rows, channels)
+            lines += _offer_second_log(log, name, head_rows, channels, keys[:1] if _find_delayed(log, logs) else [])
     lines += _describe_fit(logs)
     if actuator.measured:
         lines += ["", "[controller]", *_align(_describe_controller(logs, actuator, interview))]
@@ -99,14 +99,13 @@ def _describe_channels(log: DescribedLog, actuator: Proposed, interview: Intervi
 
 
 def _offer_second_log(
-    log: DescribedLog, name: str, rows: Sequence[Row], channels: Mapping[str, Sequence[Row]]
+    log: DescribedLog, name: str, rows: Sequence[Row], channels: Mapping[str, Sequence[Row]], keys: Sequence[str]
 ) -> list[str]:
     """Return lines, to be taken in by hand, of a second log that shows what the model lacks."""
     stem, dot, suffix = log.file.rpartition(".")
     second = {"name": f"{name}{HALF}", "log": f"{stem}{HALF}{dot}{suffix}" if dot else f"{log.file}{HALF}"}
     texts = {text.split(" = ", 1)[0]: text for text, _ in rows}
     texts |= {key: f"{key} = {format_toml(value)}" for key, value in second.items()} | {"use": 'use = "validate"'}
-    keys = [_describe_delay(log)] if log.traits.delay_s is not None else []
     bare = {table: [(text, "") for text, _ in each] for table, each in channels.items()}
     return [
         "",
@@ -127,13 +126,24 @@ def _offer_stribeck(lines: Sequence[ParameterLine]) -> list[str]:
     ]
 
 
-def _describe_delay(log: DescribedLog) -> str:
-    """Return the line of a log's delay: fitted where the log shows one, else a remark that it may be."""
-    delay = log.traits.delay_s
-    if delay is None:
+def _describe_delay(log: DescribedLog, logs: Sequence[DescribedLog]) -> str:
+    """Return the line of a log's delay: fitted where the log, or another of this drive, shows one, else a remark."""
+    found = _find_delayed(log, logs)
+    delay = None if found is None else found.traits.delay_s
+    if found is None or delay is None:
         return "# delay_s = { value = 0.002, free = true, max = 0.02 }  # if the input takes effect late"
     text = f"delay_s = {{ value = {delay:.2g}, free = true, max = {max(4.0 * delay, 0.02):.2g} }}"
-    return _comment(text, "the outputs respond late, by their phase")
+    why = "the outputs respond late, by their phase"
+    return _comment(text, why if found is log else f"{found.survey.name} shows it, and the drive is the same")
+
+
+def _find_delayed(log: DescribedLog, logs: Sequence[DescribedLog]) -> DescribedLog | None:
+    """Return the log that shows the delay of a log's input: itself, else the first of one logged alike."""
+
+    def logged(each: DescribedLog) -> tuple[str, bool]:
+        return each.roles.input, bool(each.roles.columns[each.roles.input].header.measured)
+
+    return next((x for x in (log, *logs) if x.traits.delay_s is not None and logged(x) == logged(log)), None)
 
 
 def _describe_fit(logs: Sequence[DescribedLog]) -> list[str]:
