@@ -411,7 +411,7 @@ def _rest(problem: FitProblem, start: Evaluation, old: FitProblem) -> FitProblem
 def _measure_excess(problem: FitProblem, z: Vector) -> float:
     """Return how many times its noise a residual at `z` is, where it is most."""
     residuals = compute_residuals(problem, z)
-    return _find_excess(problem, residuals, measure_floors(problem, residuals))
+    return _find_excess(problem, residuals, measure_floors(problem, residuals, z))
 
 
 @np.errstate(all="ignore")

@@ -94,7 +94,7 @@ def judge(
     }
     fit = _score_held_out_shots(_state_shares(fit, shares), minimum.problem.holdout)
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
-    floors = measure_floors(minimum.problem, residuals)
+    floors = measure_floors(minimum.problem, residuals, minimum.z)
     error = estimate_model_error(minimum.problem, minimum.z, residuals, floors, noise.matrix)
     excess = error.excess
     fit = compare_logs(widen(_state_excess(fit, excess), error.matrix), validation)

@@ -235,7 +235,7 @@ def _refit(
     found = refit.require_minimum("_refit")
     noise = refit.covariance if refit.delay_covariance is None else refit.delay_covariance
     residuals = found.residuals()
-    floors = measure_floors(found.problem, residuals)
+    floors = measure_floors(found.problem, residuals, found.z)
     error = estimate_model_error(found.problem, found.z, residuals, floors, noise.matrix)
     outputs = {
         experiment.name: {

@@ -10,22 +10,27 @@ the root of 12, which a slow signal shows in no difference. Of an output that wa
 differences are over so many samples as lie between two readings. The noise that a user states counts where the sensor's
 is coloured, as behind a filter. The excess, the residual's rms over that noise, is 1 to 1.1 of right models.
 
+A plant that follows a reading (`Experiment.follow`) is shaken by that sensor's noise, which its outputs then have as
+well. How much is seen by shaking it once more by as much: the difference that this makes is added to the noise.
+
 Both are of the residuals as they are fitted: in the band, and as the loss weighs them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.fit_experiment import FitExperiment, FitSegment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.losses import Loss
 from seaopt.estimation.problem.residual_statistics import (
     ExperimentResiduals,
     ResidualsByExperiment,
+    compute_experiment_residuals,
     compute_residuals,
 )
 from seaopt.estimation.problem.shapes import PerOutput, Vector
@@ -57,7 +62,7 @@ class NoiseFloor:
 
 def measure_excess(problem: FitProblem, z: Vector) -> dict[str, float]:
     """Return how many times its sensor's noise each output's residual is, by EXPERIMENT.OUTPUT, at unknowns `z`."""
-    return list_excess(problem, measure_floors(problem, compute_residuals(problem, z)))
+    return list_excess(problem, measure_floors(problem, compute_residuals(problem, z), z))
 
 
 def list_excess(problem: FitProblem, floors: Mapping[str, NoiseFloor]) -> dict[str, float]:
@@ -65,9 +70,31 @@ def list_excess(problem: FitProblem, floors: Mapping[str, NoiseFloor]) -> dict[s
     return {output.label: float(floors[output.experiment.name].excess[output.index]) for output in problem.outputs}
 
 
-def measure_floors(problem: FitProblem, residuals: ResidualsByExperiment) -> dict[str, NoiseFloor]:
-    """Return the noise and the residuals' rms of every experiment, by its name."""
-    return {e.name: measure_floor(e, residuals[e.name]) for e in problem.experiments}
+def measure_floors(problem: FitProblem, residuals: ResidualsByExperiment, z: Vector) -> dict[str, NoiseFloor]:
+    """Return the noise and the residuals' rms at unknowns `z` of every experiment, by its name."""
+    floors = {e.name: measure_floor(e, residuals[e.name]) for e in problem.experiments}
+    return {e.name: _add_shaking(e, residuals[e.name], floors[e.name], z) for e in problem.experiments}
+
+
+def _add_shaking(experiment: FitExperiment, residuals: ExperimentResiduals, floor: NoiseFloor, z: Vector) -> NoiseFloor:
+    """Return a floor with what the noise of readings makes of the outputs of a plant that follows them."""
+    plant, rng = experiment.model.plant, np.random.default_rng(0)
+    followed = [experiment.data.outputs.index(plant.followed[name].state) for name in plant.read_inputs]
+    if not followed:
+        return floor
+    noise = [floor.noise[o] * experiment.sigma[o] / _measure_noise_gain(experiment) for o in followed]
+
+    def shake(segment: FitSegment) -> FitSegment:
+        inputs, readings = segment.samples.u[: -len(noise)], segment.samples.u[-len(noise) :]
+        more = (each + std * rng.normal(size=each.size) for each, std in zip(readings, noise, strict=True))
+        return replace(segment, samples=replace(segment.samples, u=(*inputs, *more)))
+
+    shaken = compute_experiment_residuals(
+        replace(experiment, segments=tuple(shake(segment) for segment in experiment.segments)), z
+    )
+    change = experiment.loss.slope(shaken.weighted) - experiment.loss.slope(residuals.weighted)
+    shaking = np.sqrt(np.sum(change**2, axis=0) / np.maximum(floor.count, 1.0))
+    return replace(floor, noise=np.hypot(floor.noise, shaking))
 
 
 def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> NoiseFloor:

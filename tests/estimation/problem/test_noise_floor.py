@@ -11,7 +11,7 @@ from scipy.signal import butter, lfilter, sosfilt
 import seaopt as so
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Huber, Squares
-from seaopt.estimation.problem.noise_floor import measure_excess, measure_floor
+from seaopt.estimation.problem.noise_floor import measure_excess, measure_floor, measure_floors
 from seaopt.estimation.problem.residual_statistics import compute_residuals
 
 N = 20_000
@@ -108,3 +108,36 @@ def test_lines_between_slower_readings_do_not_hide_a_slow_error(shift):
     readings = 2.0 * np.sin(own * 2e-3) + 0.1 * np.sin(2 * np.pi * 10.0 * own * 1e-3)
     readings += np.random.default_rng(1).normal(scale=0.01, size=own.size)
     assert measure_excess(*pose(np.interp(np.arange(N), own, readings) - 2.0 * SLOW))["log.y"] > 4.0
+
+
+def test_a_followed_reading_shakes_the_outputs_with_its_noise():
+    """White noise of std s behind g/(p + 1) has g s sqrt(T/2), whatever lies between the samples; where nothing is
+    lacking the excess is 1, and what is lacking beside it shows.
+    """
+    gain, std, period = 30.0, 0.05, 1e-3
+    wave = so.plants.Reading(state="s", wave="n", sizes=("g",), friction="")
+    plant = so.Plant(
+        name="shaken", states={"s": "-", "w": "-"}, inputs={"u": "-"}, outputs={"s": "-", "w": "-"},
+        parameters={"a": "-", "g": "-", "n": "-"}, followed={"s_read": wave}, ports=(so.plants.Port(motion="s"),),
+        f=lambda t, x, u, p: {"s": p.a * u.u - x.s, "w": p.g * u.s_read - x.w}, h=lambda t, x, u, p: vars(x),
+    )  # fmt: skip
+    params = so.ParameterSet.of(a=(2.0, "-"), g=(gain, "-"), n=(1.0, "-")).free("a")
+    log = so.Log.from_arrays(time=np.arange(N) * period, u=SLOW, s=0.0 * SLOW, w=0.0 * SLOW)
+    clean = so.simulate(plant, params, log)
+    readings = {"s": clean["s"] + noise(std), "w": clean["w"] + noise(1e-3, seed=1)}
+
+    def measure(**extra):
+        columns = {name: channel + extra.get(name, 0.0) for name, channel in readings.items()}
+        log = so.Log.from_arrays(time=np.arange(N) * period, u=SLOW, **columns)
+        bench = so.Experiment(plant=plant, log=log, initial_state="rest", offset=False, name="log")
+        problem = pose_problem((bench,), params, loss=Squares())
+        (experiment,), z = problem.experiments, problem.unknowns.start
+        return experiment, measure_floors(problem, compute_residuals(problem, z), z)["log"]
+
+    experiment, found = measure()
+    assert experiment.model.plant.read_inputs == ("s_read",)
+    expected = [std, np.hypot(gain * std * np.sqrt(period / 2.0), 1e-3)]
+    assert found.noise * experiment.sigma == pytest.approx(expected, rel=0.1)
+    assert found.excess == pytest.approx(1.0, abs=0.1)
+    lacking = 5.0 * expected[1] * np.sqrt(2.0) * np.sin(np.arange(N) * 0.01)
+    assert measure(w=lacking)[1].excess[1] == pytest.approx(np.sqrt(1.0 + 25.0), rel=0.1)

@@ -33,7 +33,7 @@ def regress(u, w, y, **options):
     fit = so.fit([bench], params, method=so.OutputError(search=False), diagnostics=False)
     minimum = fit.minimum
     residuals = minimum.residuals()
-    floors = measure_floors(minimum.problem, residuals)
+    floors = measure_floors(minimum.problem, residuals, minimum.z)
     error = estimate_model_error(minimum.problem, minimum.z, residuals, floors, fit.covariance.matrix)
     return fit, error
 
