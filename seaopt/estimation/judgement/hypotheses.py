@@ -287,7 +287,7 @@ def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment)
         if not ripple:
             place = experiment.read(position)[longest] if read else run[position]
             ripple = find_ripple(posed, left, fit.parameters, place, number)
-            if not (plant.moves and ripple and ripple["n_g"] <= experiment.find_finest(position)):
+            if not (ripple and ripple["n_g"] <= experiment.find_finest(position)):
                 ripple = move_zero(posed, minimum.z, ripple, position)
     dry = 0.0 if friction is None or friction.jump is None else friction.jump(0.0, friction.add_rated(values))
     return Sizes(

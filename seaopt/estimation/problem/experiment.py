@@ -177,12 +177,11 @@ class Experiment:
         return params.with_parameters(*local)
 
     def follow(self, params: ParameterSet) -> Plant:
-        """Return the plant as it is simulated in a fit: where a link moves it follows the positions that are
-        outputs, where they are fine enough. A link that is held holds the simulated position near the measured one, by
-        its spring.
+        """Return the plant as it is simulated in a fit: it follows the positions that are outputs, where they are fine
+        enough.
         """
         plant = self.plant
-        if not plant.followed or not plant.moves:
+        if not plant.followed:
             return plant
         values = plant.complete(self.apply_own(params))
         fine = all(values[each.wave].value <= self.find_finest(each.state) for each in plant.followed.values())
@@ -193,8 +192,6 @@ class Experiment:
         and where a line stands in for one.
         """
         plant, sentences = self.plant, list[str]()
-        if not plant.moves:
-            return []
         values, follows = plant.complete(self.apply_own(params)), bool(self.follow(params).read_inputs)
         for each in plant.followed.values():
             finest, wave = self.find_finest(each.state), values[each.wave].value
