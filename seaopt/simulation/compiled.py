@@ -39,7 +39,7 @@ _FIELDS = (  # of seaopt_pass_args behind its channels; pointers are whole numbe
     (np.int64, ("settle", "start", "output_rows", "sections", "loss", "warm", "run_up")),
     (np.float64, ("t0", "tau0", "dtau")),
     (np.uint64, ("model", "correction", "x0", "offset", "gain", "drift", "sos", "knee", "gram", "rho", "count")),
-    (np.uint64, ("outputs", "columns", "states", "carry")),
+    (np.uint64, ("outputs", "columns", "states", "changes", "carry")),
     *_INFLUENCES,  # in it
 )
 
@@ -47,7 +47,7 @@ _FIELDS = (  # of seaopt_pass_args behind its channels; pointers are whole numbe
 @lru_cache(maxsize=32)
 def _arguments(nu: int, ny: int) -> np.dtype[Any]:
     """Return seaopt_pass_args of pass.c."""
-    channels = [("u", np.uint64, (nu,)), ("y", np.uint64, (ny,)), ("keep", np.uint64, (ny,))]
+    channels = [("u", np.uint64, (nu,)), ("y", np.uint64, (ny,)), ("keep", np.uint64, (ny,)), ("steps", np.uint64)]
     return np.dtype([*channels, *((name, kind) for kind, names in _FIELDS for name in names)])
 
 
@@ -238,7 +238,7 @@ def _settings(model: Model, point: Point) -> VectorM:
     if model.by_events or not model.sticks:
         rates = rate_functions(model, moving=_count_delayed(model, point) == 2)
         constants = np.array(rates.prepare(constants)).ravel()
-    return np.array([point.substeps, clock.period, clock.fraction_s, foh, *constants])
+    return np.array([clock.period, clock.fraction_s, foh, *constants])
 
 
 def _reuse_or_make(room: Any, shape: tuple[int, ...]) -> Any:
@@ -260,6 +260,7 @@ class Program:
         base["u"] = [self._address(channel) + 8 * segment.lead for channel in segment.u]
         base["y"] = [self._address(channel) for channel in segment.y] or 0
         base["keep"] = [self._address(mask, np.uint8) for mask in segment.keep] or 0
+        base["steps"] = 0 if model.linear else self._address(point.count_steps(segment), np.int64)
         base["shared"], base["drift_terms"], base["v_columns"] = layout.shared, layout.drift_terms, layout.columns
         base["lag_a"], base["lag_b"], base["lag_c"] = (*point.clock.lags, 0)[:3]
         base["tau0"], base["dtau"] = segment.drift_span
@@ -303,6 +304,7 @@ class Program:
         output_rows: int | None = None,
         columns: bool = False,
         states: bool = False,
+        changes: bool = False,
         resume: VectorM | None = None,
         room: Pass | None = None,
     ) -> Pass:
@@ -316,17 +318,19 @@ class Program:
             raise SimulationError(
                 f"{nx} states, samples {first} to {last} of {self.segment.n}: x0 or the samples do not fit"
             )
-        sums_alone = sums and resume is None and not (outputs or columns or states)
+        sums_alone = sums and resume is None and not (outputs or columns or states or changes)
         edges, starts, warm = self._split(first, last, x0, halve=sums_alone and n >= max(PARALLEL, 4 * self.run_up))
         parts = len(warm)
         gram, loss, count = np.zeros((parts, ny, nc, nc)), np.zeros((parts, ny)), np.zeros((parts, ny))
-        kept: dict[str, Any] = dict.fromkeys(("outputs", "columns", "states"))
+        kept: dict[str, Any] = dict.fromkeys(("outputs", "columns", "states", "changes"))
         if outputs:
             kept["outputs"] = _reuse_or_make(room.outputs if room else None, (rows, ny))
         if columns and self.segment.y:
             kept["columns"] = _reuse_or_make(room.columns if room else None, (n, ny, nc))
         if states:
             kept["states"] = np.empty((n, nx))
+        if changes:
+            kept["changes"] = np.zeros((n, nx))
         arguments = self._place(edges, warm, x0=starts, rho=loss, count=count, **{"gram": gram} if sums else {})
         arguments["output_rows"] = rows
         follow = sums and resume is None and self.joins  # how a state depends on the first

@@ -23,9 +23,11 @@ from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.simulation.events import EventStep
 from seaopt.simulation.model import Model, fill_parameters, linearise
+from seaopt.simulation.passes import Point, Segment
 from seaopt.simulation.runge_kutta import runge_kutta_step
 from seaopt.simulation.sticking import joint_equations, sticking_line_step, sticking_output
 
+SQUARINGS = 4  # to the power of 16, whose root is near the largest eigenvalue
 STABLE = 2.5  # of a rate times the step: order four is stable up to 2.78 along the real axis, 2.83 along the imaginary
 
 
@@ -83,6 +85,32 @@ def _count_stable_steps(model: Model, theta: bytes, period: float) -> float:
     if not np.all(np.isfinite(a)):
         return 1.0
     return float(np.ceil(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) * period / STABLE))
+
+
+@memo
+def _slope_function(model: Model) -> ca.Function:
+    slope = ca.densify(ca.jacobian(model.f, model.x))
+    return ca.Function("slope", [model.t, model.x, model.u, model.p], [slope], {"cse": True})
+
+
+@np.errstate(all="ignore")
+def find_stable_steps(
+    model: Model, point: Point, segment: Segment, states: Float[np.ndarray, "n nx"]
+) -> Float[np.ndarray, " n"]:
+    """Return how many steps are stable in each sample of a segment, from the states there: not whole numbers."""
+    n, nx, period = len(states), model.nx, point.clock.period
+    u = np.vstack([channel[:n] for channel in segment.inputs])
+    t, p = segment.start_s + period * np.arange(n), model.parameters(point.theta)
+    slopes = _slope_function(model).map(n)(t[None], states.T, u, np.repeat(p[:, None], n, 1))
+    size = np.maximum(np.sqrt(np.mean(states**2, axis=0)), 1e-300)
+    power = np.array(slopes).reshape(nx, n, nx).transpose(1, 0, 2) * size / size[:, None]
+    rate = np.zeros(n)  # logarithm of the norm of a power of the slopes, whose root is that of the largest eigenvalue
+    for _ in range(SQUARINGS):
+        norm = np.linalg.norm(power, axis=(1, 2), keepdims=True)
+        rate = 2.0 * (rate + np.log(norm[:, 0, 0]))
+        power = (power / norm) @ (power / norm)
+    rate += np.log(np.linalg.norm(power, axis=(1, 2)))
+    return np.exp(rate / 2.0**SQUARINGS) * period / STABLE
 
 
 @memo

@@ -11,7 +11,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from seaopt.plants.memo import memo
 from seaopt.records import record
@@ -29,13 +29,15 @@ Trajectory = tuple[Float[np.ndarray, "n ny"], Float[np.ndarray, "n ny nt"], Floa
 
 
 @np.errstate(all="ignore")  # a plant that overflows gives numbers that are not finite, as the compiled pass does
-def interpret_pass(model: Model, segment: Segment, point: Point, weights: Weights, stop: int, x0: VectorX) -> Pass:
+def interpret_pass(
+    model: Model, segment: Segment, point: Point, weights: Weights, stop: int, x0: VectorX, *, changes: bool = False
+) -> Pass:
     """Run the samples before `stop` in NumPy and CasADi's virtual machine; keep outputs, columns and states."""
     layout, forcing = layout_of(model.nx, model.ny, model.np, point), _inputs_in_force(model, segment, point)[:stop]
     if model.linear and point.correction is None:
-        y, dy, x = _linear_trajectory(model, layout, point, forcing, x0)
+        (y, dy, x), changed = _linear_trajectory(model, layout, point, forcing, x0), None
     else:
-        y, dy, x = _folded_trajectory(model, segment, point, forcing, x0)
+        (y, dy, x), changed = _folded_trajectory(model, segment, point, forcing, x0, changes=changes)
     ny, nc, v = model.ny, layout.columns, None
     gram, loss, count = np.zeros((ny, nc, nc)), np.zeros(ny), np.zeros(ny)
     if segment.y:
@@ -45,7 +47,7 @@ def interpret_pass(model: Model, segment: Segment, point: Point, weights: Weight
             losses, weight = _loss_and_weight(kept[:, 0], weights.loss, float(weights.knee[o]))
             gram[o] = (kept * weight[:, None]).T @ kept
             loss[o], count[o] = float(np.sum(losses)), float(len(kept))
-    return Pass(gram=gram, loss=loss, count=count, outputs=y, columns=v, states=x)
+    return Pass(gram=gram, loss=loss, count=count, outputs=y, columns=v, states=x, changes=changed)
 
 
 def _loss_and_weight(r: VectorN, loss: str, knee: float) -> tuple[VectorN, VectorN]:
@@ -118,7 +120,7 @@ def _run_abreast(
 def _split(model: Model, scheme: _Scheme, w: Any) -> tuple[Any, list[Any], list[Any]]:
     """Return t, the inputs in force, and those of the samples around, of a sample's data."""
     nu = model.nu
-    rows = [w[1 + i * nu : 1 + (i + 1) * nu] for i in range(scheme.rows)]
+    rows = [w[2 + i * nu : 2 + (i + 1) * nu] for i in range(scheme.rows)]
     return w[0], rows[: scheme.inputs], rows[scheme.inputs :]
 
 
@@ -137,10 +139,10 @@ class _Scheme:
     fractional: bool  # older inputs act for the first part of a period
     inputs: int  # in force
     rows: int  # of inputs, in a sample's data
-    substeps: int
+    steps: tuple[int, ...]  # numbers of steps that samples take
 
     @classmethod
-    def of(cls, model: Model, point: Point) -> _Scheme:
+    def of(cls, model: Model, point: Point, steps: Int[np.ndarray, " m"]) -> _Scheme:
         clock = point.clock
         return cls(
             hold=clock.hold,
@@ -148,13 +150,24 @@ class _Scheme:
             fractional=clock.fraction_s > 0.0,
             inputs=len(clock.lags),
             rows=len(_list_lags(model, point)),
-            substeps=point.substeps,
+            steps=tuple(steps.tolist()),
         )
 
 
 def _advance(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any) -> Any:
-    """Return the state and its derivatives one sample on."""
-    steps, nx, nu = scheme.substeps, model.nx, model.nu
+    """Return the state and its derivatives one sample on, in as many steps as it takes."""
+    if len(scheme.steps) == 1:
+        return _take_steps(model, scheme, layout, z, w, data, steps=scheme.steps[0])
+    arguments = [ca.MX.sym(name, *value.shape) for name, value in (("z", z), ("w", w), ("data", data))]
+    ways = [
+        ca.Function("steps", arguments, [_take_steps(model, scheme, layout, *arguments, steps=steps)])
+        for steps in scheme.steps
+    ]
+    return ca.Function.conditional("advance", ways[:-1], ways[-1])(w[1], z, w, data)
+
+
+def _take_steps(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, data: Any, *, steps: int) -> Any:
+    nx, nu = model.nx, model.nu
     t, inputs, read = _split(model, scheme, w)
     x, s = z[:, 0], z[:, 1:]
     padding = ca.MX.zeros(nx, layout.states - 1 - model.np - scheme.delay_free)
@@ -257,7 +270,7 @@ def _program(model: Model, layout: Layout, scheme: _Scheme, sizes: tuple[int, in
     y = _observe(model, scheme, layout, z, w, plant)
     after = _advance(model, scheme, layout, z, w, plant)
     if layout.corrected:
-        after = after - _correct(layout, z, y, w[1 + scheme.rows * model.nu :], data[sizes[1] :])
+        after = after - _correct(layout, z, y, w[2 + scheme.rows * model.nu :], data[sizes[1] :])
     return ca.Function("sample", [z, w, data], [after]), ca.Function("output", [z, w, data], [y])
 
 
@@ -292,16 +305,25 @@ def _fold(
 
 
 def _folded_trajectory(
-    model: Model, segment: Segment, point: Point, forcing: Float[np.ndarray, "n w"], x0: VectorX
-) -> Trajectory:
-    """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects."""
-    layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(model, point)
+    model: Model,
+    segment: Segment,
+    point: Point,
+    forcing: Float[np.ndarray, "n w"],
+    x0: VectorX,
+    *,
+    changes: bool,
+) -> tuple[Trajectory, Float[np.ndarray, "n nx"] | None]:
+    """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects, and by how much
+    steps of half the length change its states, if that is wanted.
+    """
+    steps, which = np.unique(point.count_steps(segment)[: len(forcing)], return_inverse=True)
+    layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(model, point, steps)
     clock, time = point.clock, segment.start_s + point.clock.period * np.arange(len(forcing))
     if model.linear:
         data = transition(model, point.theta, clock).ravel()
     else:
         data = np.append(model.parameters(point.theta), (clock.fraction_s, clock.period - clock.fraction_s))
-    w, plant_size = np.column_stack([time, forcing[:, :-1]]), data.size
+    w, plant_size = np.column_stack([time, which, forcing[:, :-1]]), data.size
     if point.correction is not None:
         measured, present = read_measured(segment, len(forcing))
         w = np.hstack([w, measured, present, segment.drift_basis(slice(0, len(forcing)), layout.drift_terms)])
@@ -314,8 +336,12 @@ def _folded_trajectory(
     path = _fold(lambda count: _chain(model, layout, scheme, sizes, count), start, w, data)
     flat = path[:-1].transpose(1, 0, 2).reshape(model.nx, n * layout.states)
     outputs = _output_map(model, layout, scheme, sizes, n)(flat, w.T, np.repeat(data[:, None], n, 1))
-    y = np.array(outputs).reshape(model.ny, n, layout.states).transpose(1, 0, 2)
-    return y[:, :, 0], y[:, :, 1:], path[:-1, :, 0]
+    y, changed = np.array(outputs).reshape(model.ny, n, layout.states).transpose(1, 0, 2), None
+    if changes:
+        halved = _program(model, layout, _Scheme.of(model, point, 2 * steps), sizes)[0].map(n)
+        after = np.array(halved(flat, w.T, np.repeat(data[:, None], n, 1))).reshape(model.nx, n, layout.states)
+        changed = after[:, :, 0].T - path[1:, :, 0]
+    return (y[:, :, 0], y[:, :, 1:], path[:-1, :, 0]), changed
 
 
 def read_measured(segment: Segment, stop: int) -> tuple[Float[np.ndarray, "n ny"], Any]:

@@ -16,6 +16,7 @@ typedef struct {
     const double *u[NU];
     const double *y[NY];           /* of MEASURED */
     const unsigned char *keep[NY]; /* NULL: all kept */
+    const long *steps;             /* of each row, unless LINEAR */
     long from, to;                 /* rows of the log: first, and one past the last */
     long length;                   /* rows: inputs are clamped to them */
     long lead;                     /* rows of inputs that go before row 0 */
@@ -48,6 +49,8 @@ typedef struct {
     double *outputs;               /* output_rows x NY or NULL */
     double *columns;               /* (to - from) x NY x v_columns or NULL */
     double *states;                /* (to - from) x NX or NULL */
+    double *changes;               /* (to - from) x NX or NULL: of the next state, by steps of half the length from the same one; of
+                                      passes without derivatives */
     double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
     influences into;               /* of estimates, into.into NULL: none */
 } seaopt_pass_args;
@@ -127,8 +130,9 @@ INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict
     rows(q->model, (const double (*)[NJP])q->z, w, NX, NY, y, wide);
 }
 
-INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
+INLINE void advance(hot *q, const seaopt_pass_args *a, long k, long times, int wide) {
     double w[NF + 1];
+    (void)times; /* it has no steps */
     forcing(q, a, k, w);
     rows(q->model, (const double (*)[NJP])q->z, w, 0, NX, q->next, wide);
     for (int i = 0; i < NX; i++)
@@ -141,8 +145,8 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
    is 2, f_p has a column for the delay, by which the input moves by du each second. Of a plant with a joint that sticks
    (JOINT, see events.py) the rate has the joint's mode as another argument, and there stands
      seaopt_joint(t, x, u, c) -> [speed, holding force, F(0)], d speed/dx, d speed/d theta, what a force adds to f.
-   model: steps, period, older part of the period (fractional delay), first-order hold, then c. */
-#define SETTINGS 4
+   model: period, older part of the period (fractional delay), first-order hold, then c. */
+#define SETTINGS 3
 
 typedef double hot_columns[NX][NJP] __attribute__((aligned(32)));
 
@@ -422,14 +426,14 @@ INLINE void set_samples(hot *q, const double (*restrict before)[NJP], int wide) 
 #endif
 
 INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict out)[NJP], int wide) {
-    const double *m = a->model, t = a->t0 + k * m[1];
+    const double *m = a->model, t = a->t0 + k * m[0];
     double u[NU], du[NU], older[NU];
-    const int foh = m[3] > 0.5;
-    at(a, k, !foh && m[2] > 0.0 ? a->lag_b : a->lag_a, u);
+    const int foh = m[2] > 0.5;
+    at(a, k, !foh && m[1] > 0.0 ? a->lag_b : a->lag_a, u);
     at(a, k, a->lag_c, older);
     for (int i = 0; i < NU; i++) {
-        du[i] = foh ? (older[i] - u[i]) / m[1] : 0.0;
-        u[i] += m[2] * du[i];
+        du[i] = foh ? (older[i] - u[i]) / m[0] : 0.0;
+        u[i] += m[1] * du[i];
     }
     for (int i = NU - READ; i < NU; i++) {
         u[i] = a->u[i][k];
@@ -453,13 +457,13 @@ static inline double follow(const seaopt_pass_args *a, long k, int c, double s, 
     return w[1] + s * (c1 + s * (c2 + s * c3));
 }
 
-/* With a fractional delay the older input acts first, for m[2] seconds: u_b held, or the line from u_c to u_a; then u_a
+/* With a fractional delay the older input acts first, for m[1] seconds: u_b held, or the line from u_c to u_a; then u_a
    held, or the line from u_a to u_b. */
-INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
-    const double *m = a->model, parts[2] = {m[2], m[1] - m[2]};
-    const long steps = (long)m[0];
-    const int foh = m[3] > 0.5;
-    double t = a->t0 + k * m[1], ua[NU], ub[NU], uc[NU];
+INLINE void advance(hot *q, const seaopt_pass_args *a, long k, long times, int wide) {
+    const double *m = a->model, parts[2] = {m[1], m[0] - m[1]};
+    const long steps = times * a->steps[k];
+    const int foh = m[2] > 0.5;
+    double t = a->t0 + k * m[0], ua[NU], ub[NU], uc[NU];
 #ifdef SAMPLED
     hot_columns before;
     memcpy(before, q->z, sizeof before);
@@ -476,7 +480,7 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
             line in;
             for (int c = 0; c < NU; c++) {
                 /* The older line ends at u_a, the newer one begins there. */
-                const double base = foh || part ? ua[c] : ub[c], slope = foh ? (part ? ub[c] - ua[c] : ua[c] - uc[c]) / m[1] : 0.0;
+                const double base = foh || part ? ua[c] : ub[c], slope = foh ? (part ? ub[c] - ua[c] : ua[c] - uc[c]) / m[0] : 0.0;
                 const long from = part ? i : i - count;
                 in.u0[c] = base + slope * h * from;
                 in.u1[c] = base + slope * h * (from + 1);
@@ -485,10 +489,10 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, int wide) {
             }
             for (int c = NU - READ; c < NU; c++) { /* the delay moves where steps begin on a reading's curve */
                 const long from = part ? i : i - count;
-                in.u0[c] = follow(a, k, c, (m[2] + h * from) / m[1], &in.du0[c]);
-                in.u1[c] = follow(a, k, c, (m[2] + h * (from + 1)) / m[1], &in.du1[c]);
-                in.du0[c] *= (1.0 + dh * from) / m[1];
-                in.du1[c] *= (1.0 + dh * (from + 1)) / m[1];
+                in.u0[c] = follow(a, k, c, (m[1] + h * from) / m[0], &in.du0[c]);
+                in.u1[c] = follow(a, k, c, (m[1] + h * (from + 1)) / m[0], &in.du1[c]);
+                in.du0[c] *= (1.0 + dh * from) / m[0];
+                in.du1[c] *= (1.0 + dh * (from + 1)) / m[0];
             }
             one_step(q, t, &in, m + SETTINGS, h, dh, wide);
             t += h;
@@ -639,7 +643,13 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
             if (present[o]) residual(a, o, q->y[o], measured, a->tau0 + k * a->dtau, v[o], wide);
             else memset(v[o], 0, NCP * sizeof(double));
         }
-        advance(q, a, k, wide);
+        double *change = wide == 1 && a->changes ? a->changes + (k - a->from) * NX : 0;
+        if (change) memcpy(q->next, q->z, sizeof q->z);
+        for (long times = change ? 2 : 1; times; times--) {
+            advance(q, a, k, times, wide);
+            for (int i = 0; change && i < NX; i++) change[i] = times == 2 ? q->z[i][0] : change[i] - q->z[i][0];
+            if (times == 2) memcpy(q->z, q->next, sizeof q->z);
+        }
 #if CORRECT
         for (int o = 0; o < NY; o++)
             if (MEASURED && present[o])
@@ -669,7 +679,7 @@ ONCE void run_up(const seaopt_pass_args *a) {
     seaopt_pass_args alone = *a;
     alone.from = alone.start = a->from - a->run_up;
     alone.to = a->from;
-    alone.gram = alone.outputs = alone.columns = alone.states = 0;
+    alone.gram = alone.outputs = alone.columns = alone.states = alone.changes = 0;
     alone.into.into = 0;
     alone.carry = (double *)&reached;
     one_pass(&alone, 1);

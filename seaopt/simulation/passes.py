@@ -10,7 +10,7 @@ from dataclasses import field
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from seaopt.errors import SimulationError
 from seaopt.records import record
@@ -18,6 +18,7 @@ from seaopt.signals import VectorM, VectorN
 from seaopt.simulation.discretisation import Clock
 
 MAX_SECTIONS = 8  # as in layout.h
+SLACK = 1e-9  # of a step: rounding of a share
 RobustLoss = Literal["square", "huber", "soft_l1"]
 Influence = Float[np.ndarray, "ny p nc"]  # of the column v of an output on p estimates
 DoubleSum = Float[np.ndarray, "2 p p"]  # over all t and s, and over t = s
@@ -74,6 +75,8 @@ class Segment:
         Time of the first sample, for plants that depend on time.
     drift_span : (float, float)
         Drift's coordinate, which runs from -1 to 1 over the whole log, at the first sample, and its step.
+    shares : array, shape (2, n), optional
+        Parts of a point's `substeps` and of its `stable` steps: each sample takes the larger number. All if left out.
     """
 
     u: tuple[VectorM, ...]
@@ -82,6 +85,7 @@ class Segment:
     lead: int = 0
     start_s: float = 0.0
     drift_span: tuple[float, float] = (0.0, 0.0)
+    shares: Float[np.ndarray, "2 n"] | None = None
 
     @property
     def n(self) -> int:
@@ -115,6 +119,10 @@ class Point:
         Period, hold and delay.
     substeps : int
         Runge-Kutta steps per period (a linear model needs none).
+    stable : int
+        The least that are stable.
+    halved : bool
+        Whether all of these steps are made in two.
     correction : array, shape (1 + ns, nx, ny), or None
         Gain by which the prediction error corrects the next state, and its derivatives with respect to theta, a free
         delay, and what else it depends on (ns in all). None: the plant is simulated.
@@ -126,12 +134,26 @@ class Point:
     clock: Clock
     drift: Float[np.ndarray, "ny nd"] = field(default_factory=lambda: np.zeros((1, 0)))
     substeps: int = 1
+    stable: int = 1
+    halved: bool = False
     correction: Float[np.ndarray, "ns1 nx ny"] | None = None
 
     @property
     def drift_terms(self) -> int:
         """Drift coefficients per output."""
         return self.drift.shape[1]
+
+    @property
+    def most_steps(self) -> int:
+        """The Runge-Kutta steps of a sample that takes all."""
+        return (1 + self.halved) * max(self.substeps, self.stable)
+
+    def count_steps(self, segment: Segment) -> Int[np.ndarray, " n"]:
+        """Return the Runge-Kutta steps of every sample of a segment."""
+        if segment.shares is None:
+            return np.full(segment.n, self.most_steps)
+        steps = np.maximum(self.substeps * segment.shares[0], self.stable * segment.shares[1])
+        return (1 + self.halved) * np.maximum(np.ceil(steps - SLACK), 1.0).astype(np.int64)
 
     def read(self, outputs: Float[np.ndarray, "ny m"], segment: Segment, rows: slice) -> Float[np.ndarray, "ny m"]:
         """Return what the sensors read of model outputs over rows of a segment: gain * output + offset + drift."""
@@ -182,6 +204,7 @@ class Pass:
     outputs: Float[np.ndarray, "n ny"] | None = None  # model outputs, without gain and offset
     columns: Float[np.ndarray, "n ny nc"] | None = None  # the v of every sample
     states: Float[np.ndarray, "n nx"] | None = None  # state trajectory
+    changes: Float[np.ndarray, "n nx"] | None = None  # of each sample's next state, by steps of half the length
     sensitivity: Float[np.ndarray, "nx nx"] | None = None  # of the last state to the first: long logs, nonlinear plants
 
 

@@ -91,7 +91,8 @@ def _key(model: Model, segment: Segment, point: Point, x0: VectorX, weights: Wei
     """Return what tells passes apart; models and segments are told by their identity, for they are kept as well."""
     arrays = (point.theta, point.offset, point.gain, point.drift, point.correction, x0, weights.sections, weights.knee)
     numbers = tuple(None if array is None else array.tobytes() for array in arrays)
-    return id(model), id(segment), point.clock, point.substeps, weights.settle, weights.loss, numbers
+    steps = point.most_steps if segment.shares is None else (point.substeps, point.stable, point.halved)
+    return id(model), id(segment), point.clock, steps, weights.settle, weights.loss, numbers
 
 
 def run_passes(
@@ -107,6 +108,7 @@ def run_passes(
     output_rows: int | None = None,
     columns: bool = False,
     states: bool = False,
+    changes: bool = False,
     keep: bool = False,
 ) -> Pass:
     """Run a segment, or its first samples, from a state.
@@ -124,6 +126,8 @@ def run_passes(
         Without measured outputs compiled code makes none.
     outputs, columns, states : bool
         Keep the model outputs, the residuals with their derivatives, the state trajectory.
+    changes : bool
+        Find by how much steps of half the length change each sample's next state.
     output_rows : int, optional
         Keep the outputs of so many first samples only.
     keep : bool
@@ -138,7 +142,7 @@ def run_passes(
     chosen = weights if weights is not None else Weights.plain(model.ny)
     last = segment.n if stop is None else stop
     rows = (last if output_rows is None else min(output_rows, last)) if outputs else 0
-    kept = _kept.get() if sums and last == segment.n and not states else None
+    kept = _kept.get() if sums and last == segment.n and not (states or changes) else None
     key = _key(model, segment, point, x0, chosen) if kept is not None else None
     result = kept.find(key, rows, columns=columns or keep) if kept is not None else None
     if result is None:
@@ -146,12 +150,20 @@ def run_passes(
         made = last if whole else rows
         program = Program.make(model, segment, point, chosen)
         if program is None:
-            result = interpret_pass(model, segment, point, chosen, last, x0)
+            result = interpret_pass(model, segment, point, chosen, last, x0, changes=changes)
         elif kept is not None:
             result = _run_kept(kept, program, x0, output_rows=made, columns=columns or whole)
         else:
             result = program.run(
-                0, last, x0, sums=sums, outputs=made > 0, output_rows=made, columns=columns, states=states
+                0,
+                last,
+                x0,
+                sums=sums,
+                outputs=made > 0,
+                output_rows=made,
+                columns=columns,
+                states=states,
+                changes=changes,
             )
         if kept is not None:
             kept.add(key, result, model, segment)

@@ -135,7 +135,7 @@ class Bench:
     def _pass(self, u: Signal, substeps: int) -> Pass:
         (segment,), z = self.experiment.segments, self.problem.unknowns.start
         inputs = tuple(u if i == self.channel else still for i, still in enumerate(segment.samples.u))
-        point = replace(self.experiment.point(z), substeps=substeps)
+        point = replace(self.experiment.point(z), substeps=substeps, stable=1)
         samples = replace(segment.samples, u=inputs)
         return run_passes(self.model, samples, point, segment.start(z), outputs=True, states=True)
 

@@ -81,7 +81,8 @@ class FitExperiment:
     loss: Loss  # applied to residuals in sigma
     band_hz: tuple[float, float] | None = None  # residuals are filtered to this band
     holdout: float = 0.0  # last fraction of the log that gets no weight
-    substeps: int = 1  # least number of integration steps per sample; see `count_steps`
+    substeps: int = 1  # least number of integration steps per sample, but for shares of them; see `count_steps`
+    halved: bool = False  # whether each of them is made in two
     predictor: SteadyStateFilter | None = None  # with one, the residual is the error of the prediction one sample ahead
 
     @property
@@ -127,8 +128,12 @@ class FitExperiment:
 
     def count_steps(self, z: Vector) -> int:
         """Return the integration steps per sample: more than asked for where fewer would be unstable."""
+        return max(self.substeps, self.count_least_steps(z))
+
+    def count_least_steps(self, z: Vector) -> int:
+        """Return the integration steps per sample that are stable, or 1 where those are too many."""
         stable = self.count_stable_steps(z)
-        return self.substeps if stable > MAX_SUBSTEPS else max(self.substeps, int(stable))
+        return 1 if stable > MAX_SUBSTEPS else max(int(stable), 1)
 
     def is_too_stiff(self, z: Vector) -> bool:
         """Whether rates near rest, as sharp friction's, ask for finer steps than `MAX_SUBSTEPS` in a sample."""
@@ -152,7 +157,9 @@ class FitExperiment:
                 delay_s=slots.delay.at(z),
                 delay_free=slots.delay.index is not None,
             ),
-            substeps=self.count_steps(z),
+            substeps=self.substeps,
+            stable=self.count_least_steps(z),
+            halved=self.halved,
         )
         if self.predictor is None:
             return point

@@ -12,6 +12,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
 from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.estimation.solver.least_squares import DECREMENT, STILL_MOVING, Callback, Solution, find_blocked, minimise
+from seaopt.estimation.solver.step_shares import share_many, share_steps
 from seaopt.estimation.solver.step_size import (
     Checks,
     StepError,
@@ -235,6 +236,8 @@ def settle_roughly(
     if not checked:
         problem, evaluation = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
         problem = problem.with_each(substeps=min(ROUGH_SUBSTEPS, *(e.substeps for e in problem.experiments)))
+    else:
+        problem, evaluation = share_many(problem, evaluation)
     unknowns, solution, iterations = problem.unknowns, None, 0
     for attempt in range(ROUGH_ROUNDS):
         problem, evaluation = _take_sigma(problem, evaluation)
@@ -269,10 +272,12 @@ def refine_to(solved: Solved, fine: FitProblem, ends: Callable[[Evaluation], boo
     """Return a rough minimum with integration steps as fine as a problem's, so that it can be compared with its own.
     `ends`: tells of each point whether it is all that is asked for.
     """
-    steps = {e.name: e.substeps for e in fine.experiments}
-    problem = solved.problem.with_each(substeps=max(steps.values()))
-    if all(e.substeps >= problem.experiments[0].substeps for e in solved.problem.experiments):
+    problem, z = solved.problem, solved.solution.z
+    most = max(experiment.substeps for experiment in fine.experiments)
+    coarser = {e.name: max(most, e.count_steps(z)) for e in problem.experiments if e.substeps < most}
+    if not coarser:
         return solved
+    problem = share_steps(problem, z, coarser)
     problem, evaluation = _take_sigma(problem, problem.evaluate(solved.solution.z))
     if ends is not None and ends(evaluation):
         found = replace(solved.solution, z=evaluation.z, evaluation=evaluation)

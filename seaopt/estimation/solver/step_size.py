@@ -11,6 +11,7 @@ from seaopt.estimation.problem.fit_experiment import FIRST_SAMPLES, MAX_SUBSTEPS
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.shapes import PerOutput, Vector
+from seaopt.estimation.solver.step_shares import share_many, share_steps
 from seaopt.plants.friction import remembers
 from seaopt.records import record
 from seaopt.simulation import Pass
@@ -67,7 +68,7 @@ def choose_first_steps(
     while True:
         finer = problem.map(lambda e, evaluation=start: _choose_first_steps(e, evaluation, most, roughly=roughly))
         if finer == [experiment.count_steps(start.z) for experiment in problem.experiments]:
-            return problem, start
+            return share_many(problem, start)
         problem = _with_substeps(problem, finer)
         start = problem.evaluate(start.z)
 
@@ -77,7 +78,7 @@ def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most:
     z, fine = evaluation.passes.z, []
     if experiment.model.linear or experiment.count_steps(z) >= most:
         return experiment.count_steps(z)
-    halved = _halve_steps(experiment, z)
+    halved = _halve_steps(experiment)
     for segment in experiment.segments:
         stop = min(segment.samples.n, FIRST_SAMPLES)
         fine.append(halved.run(segment, z, stop=stop, sums=False, outputs=True))
@@ -112,7 +113,7 @@ def refine_bristles(problem: FitProblem, z: Vector) -> FitProblem:
         min(2 * count, MAX_SUBSTEPS) if remembers(experiment.data.plant) else count
         for experiment, count in zip(problem.experiments, steps, strict=True)
     ]
-    return problem if finer == steps else _with_substeps(problem, finer)
+    return share_steps(problem, z, _list_finer(problem, steps, finer))
 
 
 def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
@@ -129,7 +130,7 @@ def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) ->
         if finer == substeps:
             return problem, evaluation, checks
         trusted = all(new < MUCH_FINER * old for new, old in zip(finer, substeps, strict=True))
-        problem = _with_substeps(problem, finer)
+        problem = share_steps(problem, evaluation.z, _list_finer(problem, substeps, finer))
         # Where the error was looked at steps of half the length have been made; offsets follow from there. Where joints
         # stick a search goes another way by as little as rounding.
         made, curved = evaluation.passes.z, ~problem.unknowns.linear
@@ -192,6 +193,10 @@ def _find_stiffest(problem: FitProblem, z: Vector) -> float:
     return max(experiment.count_stable_steps(z) for experiment in problem.experiments)
 
 
+def _list_finer(problem: FitProblem, before: Sequence[int], finer: Sequence[int]) -> dict[str, int]:
+    return {e.name: new for e, old, new in zip(problem.experiments, before, finer, strict=True) if new != old}
+
+
 def _with_substeps(problem: FitProblem, substeps: Sequence[int]) -> FitProblem:
     return problem.with_values("substeps", {e.name: m for e, m in zip(problem.experiments, substeps, strict=True)})
 
@@ -219,7 +224,7 @@ def measure_step_error(problem: FitProblem, experiment: FitExperiment, evaluatio
     if experiment.model.linear:
         return StepError()
     z, passes, n = evaluation.passes.z, evaluation.passes.by_experiment[experiment.name], evaluation.z.size
-    fine = _halve_steps(experiment, z).run_all(z)
+    fine = _halve_steps(experiment).run_all(z)
     worst = _measure_output_error(experiment, z, passes, fine)
     weighted = replace(experiment, sigma=_floored_sigma(experiment))
     coarse = weighted.normal(passes, n)
@@ -234,8 +239,8 @@ def measure_step_error(problem: FitProblem, experiment: FitExperiment, evaluatio
     return StepError(output=worst, parameter=float(np.max(moved, initial=0.0)))
 
 
-def _halve_steps(experiment: FitExperiment, z: Vector) -> FitExperiment:
-    return replace(experiment, substeps=2 * experiment.count_steps(z))
+def _halve_steps(experiment: FitExperiment) -> FitExperiment:
+    return replace(experiment, halved=True)
 
 
 def _whole_error(experiment: FitExperiment) -> float:
