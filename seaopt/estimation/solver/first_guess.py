@@ -20,7 +20,7 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.shapes import ParameterVector, Vector
 from seaopt.frequency.response import FrequencyResponse, conditioned_responses, responses
 from seaopt.parameters import ParameterSet
-from seaopt.plants.friction import remove_friction
+from seaopt.plants.friction import leave_out_waves, remove_friction
 from seaopt.plants.sensors.difference import read_positions
 from seaopt.records import record
 from seaopt.simulation import Model, linearise, make_model
@@ -131,7 +131,7 @@ def _choose_target(
             if (difference := data.differences.get(data.outputs[o])) is not None:
                 shift[:, column] *= difference.respond(s, log.period)
     if not model.linear and plant.friction:
-        plant = remove_friction(plant)
+        plant = leave_out_waves(remove_friction(plant))
     if plant is not data.plant:
         model = make_model(plant, data.apply_own(params), model.free, model.outputs)
     model = linearise(model)

@@ -69,9 +69,10 @@ class OutputError(Method):
     def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle from the best start that can be found."""
         best, guesses = find_start(problem, self)
-        spent = 0
+        best, spent = _approach_waves(problem, best, callback) if self.search else (best, 0)
         if self.search and any(e.model.sticks for e in problem.experiments) and explains_little(problem, best.power):
-            best, spent = _compare_predicting(problem, best, self, callback)
+            best, more = _compare_predicting(problem, best, self, callback)
+            spent += more
         solved = settle(problem, best, self.max_iterations, callback)
         solved = replace(solved, solution=replace(solved.solution, iterations=spent + solved.solution.iterations))
         if not self.search:
@@ -229,6 +230,9 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
         return loosen_start(problem, problem.evaluate(problem.unknowns.start)), []
     rng = np.random.default_rng(require_seed(method.seed, EstimationError))
     guesses, matched = guess_from_responses(problem, rng)
+    waves = _list_waves(problem, sizes=True)  # no response shows them
+    for guess in guesses:
+        guess[waves] = problem.unknowns.start[waves]
     guessed = problem.evaluate(guesses[0]) if guesses else None
     if guessed is not None and matched and not explains_little(problem, guessed.power):
         return guessed, guesses
@@ -243,6 +247,25 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
         )
         best = best if z is None else min(best, problem.evaluate(z), key=lambda each: each.cost)
     return best, guesses
+
+
+def _approach_waves(problem: FitProblem, start: Evaluation, callback: Callback | None) -> tuple[Evaluation, int]:
+    """Return a rough minimum at the given numbers of waves, and its iterations; the start where none is fitted. While
+    other values are far off the number follows what they leave, to one from which nothing leads back.
+    """
+    places = _list_waves(problem)
+    if not places or not np.isfinite(start.cost):
+        return start, 0
+    held = replace(problem, unknowns=problem.unknowns.bound(places, start.z[places], start.z[places]))
+    rough = settle_roughly(held, held.evaluate(start.z), name_phase(callback, "looking for a start"))
+    return problem.evaluate(rough.solution.z), rough.solution.iterations
+
+
+def _list_waves(problem: FitProblem, *, sizes: bool = False) -> list[int]:
+    """Return where the numbers of waves stand among the unknowns, with or without their sizes."""
+    readings = [reading for e in problem.experiments for reading in e.model.plant.followed.values()]
+    names = {name for each in readings for name in (each.wave, *(each.sizes if sizes else ()))}
+    return [i for i, name in enumerate(problem.unknowns.names) if name.rpartition(".")[2] in names]
 
 
 def _compare_predicting(

@@ -30,8 +30,8 @@ ENCODER = 2.0 * math.pi / 4096.0
 
 
 @cache
-def swing(seconds=8.0):
-    """Return current, motor and link of a pendulum whose motor cogs."""
+def swing(seconds=8.0, *, held=False):
+    """Return current, motor and link of a pendulum whose motor cogs; `held`: of one whose link does not move."""
     p, weight = TRUTH, LINK["m"] * 9.81 * LINK["L"]
     _, current = drive(seconds, RATE_HZ, 1.2, seed=1, top_hz=8.0)
 
@@ -42,6 +42,8 @@ def swing(seconds=8.0):
         rub = p["f_c"] * math.tanh(speed / p["v_s"]) + p["b_r"] * speed
         rub += COGS["a_g"] * math.sin(phase) + COGS["b_g"] * math.cos(phase)
         push = p["K_tau"] * ampere - rub - torque / p["N"]
+        if held:
+            return speed, push / p["J_m"], 0.0, 0.0
         return speed, push / p["J_m"], turn, (torque - LINK["d_l"] * turn - weight * math.sin(link)) / LINK["J_l"]
 
     angle, _, link, _ = integrate(rates, 4, current, 1.0 / RATE_HZ, 40)
@@ -135,6 +137,27 @@ def test_a_line_in_place_of_a_position_is_told(missing, says):
     experiment, params = pose(_hide(record(), "theta_m", slice(1000, 1000 + missing)), parts=("cogging",), **COGS)
     said = experiment.describe_readings(params)
     assert [f"up to {missing} samples" in text for text in said] == [True] * says
+
+
+def test_a_held_actuator_is_fitted_from_values_and_a_delay_that_are_off():
+    """Its own position would do at the minimum; from here fits of it end at other waves, a response's guess as well."""
+    current, angle, _ = swing(4.0, held=True)
+    noise = np.random.default_rng(2).normal(size=(2, angle.size))
+    log = so.Log.from_arrays(
+        time=np.arange(angle.size) / RATE_HZ,
+        I=current,
+        tau_s=TRUTH["k_s"] / TRUTH["N"] * angle + 0.05 * noise[0],
+        theta_m=ENCODER * np.round(angle / ENCODER + 0.3 * noise[1]),
+    )
+    plant = so.plants.rotary(link="locked", parts=("cogging",))
+    params = plant.defaults.update(**TRUTH, **COGS)
+    params = params.update(J_m=3.2e-5, k_s=240.0, f_c=0.015, a_g=0.004, b_g=0.004, n_g=42.1)
+    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
+    experiment = so.Experiment(plant=plant, log=log, initial_state="rest", delay_s=delay)
+    fit = so.fit([experiment], params.free("J_m", "b_r", "f_c", "k_s", *COGS), diagnostics=False)
+    for name, value in {**TRUTH, **COGS}.items():
+        if fit.parameters[name].free:
+            assert fit.parameters[name].value == pytest.approx(value, rel=0.01), name
 
 
 def test_a_log_without_the_position_is_not_followed():
