@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 POINTS_PER_INCH = 72.0  # the units of a drawing
 _COLOUR = re.compile(r"#[0-9a-f]{6}\b")
-_DIGITS = re.compile(r"\b\d+\.\d{4,}\b")  # of a drawing of 350 points: 3e-6 of an axis is left
+_DIGITS = re.compile(r"(?<=\d\.\d{3})\d+\b")  # beyond a thousandth of a point, of a drawing that is 350 wide
 _TAG = re.compile(r"<[^>]*>")
 _STYLE = re.compile(r'style="([^"]*)"')
 
@@ -164,14 +164,9 @@ def _fit_to_page(svg: str, name: str, alternative: str) -> str:
         if attribute != "xmlns:xlink":
             body = re.sub(rf'(<svg[^>]*?)\s{attribute}="[^"]*"', r"\1", body, count=1)
     body = _STYLE.sub(lambda match: f'style="{_COLOUR.sub(_follow, match.group(1))}"', body)
-    body = _TAG.sub(lambda match: _DIGITS.sub(_shorten, match.group(0)), body)  # not the numbers at ticks
+    body = _TAG.sub(lambda match: _DIGITS.sub("", match.group(0)), body)  # not the numbers at ticks
     body = re.sub(r"\s*\n\s*", "\n", body).replace("\nL ", "L")
     return body.replace("<svg", f'<svg role="img" aria-label="{escape(printable(alternative))}"', 1).strip()
-
-
-def _shorten(match: re.Match[str]) -> str:
-    """Return a coordinate with three decimals."""
-    return f"{float(match.group(0)):.3f}".rstrip("0").rstrip(".")
 
 
 def _follow(match: re.Match[str]) -> str:
