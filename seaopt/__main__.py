@@ -11,7 +11,7 @@ from typing import NoReturn
 
 from seaopt import __version__
 
-COLLECTED = (10_000, 20, 50)  # new objects between collections: by default a sixth of a whole run is spent in them
+COLLECTED = 10_000  # new objects between collections, which by default take a sixth of a whole run
 
 
 def main() -> None:
@@ -20,7 +20,7 @@ def main() -> None:
         with suppress(OSError):  # nobody reads it
             os.write(1, f"seaopt {__version__}\n".encode())
         return
-    gc.set_threshold(*COLLECTED)
+    gc.set_threshold(COLLECTED)
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:  # else nobody may interrupt it, as below nohup
         signal.signal(signal.SIGINT, _leave)  # an import that is interrupted may raise anything, anywhere

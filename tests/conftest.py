@@ -27,6 +27,8 @@ import pytest
 from beartype import BeartypeConf, FrozenDict, beartype
 from hypothesis import settings
 
+gc.set_threshold(10_000)  # new objects between collections: the default takes a tenth of the tests' time
+
 # A whole number is a float, and choices are strings: the tests give wrong ones on purpose, to see seaopt's own errors.
 CHOICES = (
     ("unlumped", "lumped"),

@@ -1,10 +1,12 @@
 """A schedule as a user makes one: tune, certify, report, export; and what is refused."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from seaopt.machine import bring_up
 from tests.cli.test_schemas import validator
 
 KNEE = Path(__file__).resolve().parents[2] / "problems" / "lever_knee.toml"
@@ -117,8 +119,12 @@ current_limit_A = 9.0
 SCHEDULE = 'schedule = { over = "k", points = [5e5, 8e5] }\n'
 
 
-def test_every_command_takes_what_was_tuned_with_more_of_a_reserve_than_is_asked(folder, seaopt, without_simulation):
+def test_every_command_takes_what_was_tuned_with_more_of_a_reserve_than_is_asked(
+    folder, seaopt, without_simulation, monkeypatch
+):
     """What the draws of the certificate need is taken off the limits while it is tuned, and the file says so."""
+    # The stages of the law itself: slower laws are tuned anew, in half of this test's time.
+    monkeypatch.setattr("seaopt.cli.machine.bring_up", partial(bring_up, fractions=()))
     (folder / "stand.toml").write_text(STAND + SCHEDULE, encoding="utf-8")
     assert seaopt("tune", "stand.toml").returncode == 0
     path = folder / "out" / "controller.json"
