@@ -10,8 +10,9 @@ the damping sigma_1. It may stick while others slide, as a spring does behind a 
 either state, and those that are curves of the velocity together.
 
 A force that is a wave of a position (cogging) has any slope from -n a to n a at rest, by where the motor stands, which
-no model knows; over many waves it has none. Sliding it is left out; stuck it is a spring of n a, as in the well where
-the motor comes to rest. What it does on its crests, and to a motion of about a wave, only simulations show.
+no model knows; over many waves it has none. Sliding it is left out. Stuck it is what dry friction leaves of it, a
+spring of n (a - f_c) as in the well where the motor comes to rest; friction that holds more than the wave pushes holds
+it anywhere. What it does on its crests, and to a motion of about a wave, only simulations show.
 """
 
 from __future__ import annotations
@@ -161,9 +162,13 @@ def _flatten(plant: Plant) -> Callable[[Any], Any]:
     return lambda p: with_values(p, sizes) if sizes else p
 
 
-def _steepest_wave(reading: Reading, p: Any) -> Any:
-    """Return the steepest slope of a wave; its derivative by the sizes is zero where they are."""
-    return getattr(p, reading.wave) * ca.sqrt(sum(getattr(p, size) ** 2 for size in reading.sizes) + LEAST_SIZE**2)
+def _steepest_wave(plant: Plant, reading: Reading, p: Any) -> Any:
+    """Return the steepest slope of a wave beyond what friction holds; its derivative by the sizes is zero where they
+    are.
+    """
+    friction, size = plant.friction[reading.friction], sum(getattr(p, name) ** 2 for name in reading.sizes)
+    held = 0.0 if friction.jump is None else friction.jump(0.0, friction.add_rated(p))
+    return getattr(p, reading.wave) * ca.fmax(ca.sqrt(size + LEAST_SIZE**2) - held, 0.0)
 
 
 def _list_waves(plant: Plant, params: CompletedParameters) -> list[Reading]:
@@ -302,7 +307,7 @@ def _friction_parameters(plant: Plant) -> frozenset[str]:
     bounds = [bound_slopes(friction, p) for friction in plant.friction.values()]
     spans = [ca.SX(steepest - flattest) for flattest, steepest in bounds]
     spans += [ca.SX(bristles.stiffness(p)) for bristles in _list_bristles(plant).values()]
-    spans += [ca.SX(_steepest_wave(reading, p)) for reading in plant.followed.values()]
+    spans += [ca.SX(_steepest_wave(plant, reading, p)) for reading in plant.followed.values()]
     return frozenset(_list_parameters(plant, ca.vertcat(*spans)))
 
 
@@ -333,7 +338,7 @@ def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
             forces[name] += bristled[name].stiffness(p) * bristled[name].coordinate(x, p)
         for reading in plant.followed.values():
             if reading.friction in forces:
-                forces[reading.friction] += _steepest_wave(reading, p) * getattr(x, reading.state)
+                forces[reading.friction] += _steepest_wave(plant, reading, p) * getattr(x, reading.state)
         readings = {name: getattr(x, reading.state) for name, reading in plant.followed.items()}
         return with_values(u, {**forces, **readings})
 

@@ -26,7 +26,7 @@ Parts of `seaopt.plants.parts`; each is nothing where its parameters are zero:
     A force on the motor that its position alone decides, :math:`a_g \sin(n_g \theta) + b_g \cos(n_g \theta)`, of
     magnets that meet slots, or of balls that meet a groove. Where a log has the position, a fit takes it from there: a
     simulated one that is off by a wave has a minimum of its own. The phase is then that of the encoder's zero. Linear
-    loops see no slope of it where the motor slides, and a spring of the steepest where it is stuck.
+    loops see no slope of it where the motor slides, and stuck a spring of what of it friction does not hold.
 ``stand``
     What holds the spring gives, :math:`c_t` per unit of its effort, so that spring and stand are in series:
     :math:`k/(1 + k c_t)` is what a held link feels.
