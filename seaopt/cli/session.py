@@ -202,8 +202,12 @@ class Session:
         return self.problem.values(self.parameters())
 
     def _warn_of_design(self, plants: Iterable[Plant]) -> None:
-        """Name on stderr the parameters of plants that the fit cannot tell, and a delay that is too short."""
-        names = {name for plant in plants for name in plant.parameters}
+        """Name on stderr why an earlier fit is not met, the parameters of plants that the fit cannot tell, and a delay
+        that is too short.
+        """
+        names, source = {name for plant in plants for name in plant.parameters}, self.parameters()
+        if isinstance(source, Fit) and not source.met and self._path("fit") not in self.written:
+            self._say_once("warning", [f"{self._path('fit')}: {source.verdict}"])
         self._say_once("warning", warn_unidentified(self.values(), names))
         self._spec()
 
