@@ -191,15 +191,26 @@ def tune_problem(
     if schedule is not None and not rounds:
 
         def make(
-            asked: ControllerSpec, witnesses: Mapping[str, Any], near: ScheduledController | None, part: Progress
+            asked: ControllerSpec,
+            witnesses: Mapping[str, tuple[Plant, ParameterSet]],
+            near: ScheduledController | None,
+            points: Sequence[float],
+            part: Progress,
         ) -> ScheduledController:
-            options: dict[str, Any] = {**scheduled, "draws": draws, "near": near, "progress": part}
-            tuned = tune_schedule(problem.design_plant, values, asked, robust_to={**robust_to, **witnesses}, **options)
+            bands = schedule.bandwidth_hz and [schedule.bandwidth_hz[schedule.points.index(at)] for at in points]
+            whole = len(points) == len(
+                schedule.points
+            )  # a measured response has its place, where a pilot may have no point
+            kept = {name: at for name, at in robust_to.items() if whole or not isinstance(at, MeasuredResponse)}
+            options: dict[str, Any] = {"draws": draws, "witnesses": witnesses, "near": near, "progress": part}
+            tuned = tune_schedule(
+                problem.design_plant, values, asked, schedule.over, points, kept, bandwidths_hz=bands, **options
+            )
             return complete_schedule(problem, tuned, source)
 
         if rounds == 0:
-            return make(spec, {}, None, progress)
-        return keep_reserve(make, partial(_look, problem, source=source), spec, progress)
+            return make(spec, {}, None, schedule.points, progress)
+        return keep_reserve(make, partial(_look, problem, source=source), spec, schedule.points, progress)
     if not rounds:
         tuned = tune(design, values, spec, robust_to, draws=draws, progress=progress)
         tuned = complete_controller(problem, tuned, source)

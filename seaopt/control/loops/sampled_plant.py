@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from threading import get_ident
 from typing import Any
 
 import casadi as ca
@@ -35,6 +36,7 @@ from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import DRIVE_DELAY, dynamics_function, refuse_samples
 from seaopt.records import record
 from seaopt.signals import ComplexM, MatrixNN, VectorM, VectorN
+from seaopt.simulation.direct_call import DirectCall
 from seaopt.units import factor
 
 PerPlant = Float[np.ndarray, " k"]
@@ -383,21 +385,21 @@ def _map_columns(
     """Return a plant's CasADi function at every column, in blocks that CasADi maps over."""
     count = arguments[0].shape[1]
     block = next((size for size in MAPPED if size >= count), MAPPED[-1])
-    function = _block_function(plant, make, block)
+    function = _block_call(plant, make, block, get_ident())
     parts: list[list[Any]] = []
     for start in range(0, count, block):
         columns = [values[:, start : start + block] for values in arguments]
         width = columns[0].shape[1]
         repeated = np.minimum(np.arange(block), width - 1)  # `np.pad` would take longer than the function
-        results = function.call([ca.DM(values[:, repeated]) for values in columns])
-        parts.append([np.array(values)[:, : values.shape[1] // block * width] for values in results])
+        results = function(*(values[:, repeated].ravel(order="F") for values in columns))
+        parts.append([values[:, : values.shape[1] // block * width] for values in results])
     return [np.concatenate(pieces, axis=1) for pieces in zip(*parts, strict=True)]
 
 
 @memo
-def _block_function(plant: Plant, make: Callable[[Plant], Any], block: int) -> Any:
-    """Return a plant's CasADi function, mapped over a block of columns."""
-    return make(plant) if block == 1 else make(plant).map(block)
+def _block_call(plant: Plant, make: Callable[[Plant], Any], block: int, _thread: int) -> DirectCall:
+    """Return a plant's CasADi function, of dense results, over a block of columns; a thread has one to itself."""
+    return DirectCall(make(plant) if block == 1 else make(plant).map(block))
 
 
 @memo
@@ -405,7 +407,7 @@ def _drift_function(plant: Plant) -> Any:
     """Return the CasADi function (x, u, p, dp) -> derivative of f along dp."""
     dp = ca.SX.sym("along", plant.p.shape[0])
     dynamics = ca.substitute(plant.dynamics, plant.t, 0.0)
-    return ca.Function("drift", [plant.x, plant.u, plant.p, dp], [ca.jtimes(dynamics, plant.p, dp)])
+    return ca.Function("drift", [plant.x, plant.u, plant.p, dp], [ca.densify(ca.jtimes(dynamics, plant.p, dp))])
 
 
 @memo

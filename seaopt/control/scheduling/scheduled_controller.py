@@ -14,6 +14,7 @@ import numpy as np
 from seaopt.codec import OrInfinite, to_content
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.realisation import choose_limit
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, Gains
@@ -211,9 +212,11 @@ class ScheduledController(Result, Worded):
 
     def _judge_place(self, value: float) -> PlaceFigures:
         """Judge the law at a value between the points: all limits, and 0.9 of the bandwidth that is asked there."""
-        frozen, asked = self.at(value), self.asked_hz(value)
-        others = place_plants(self.others, self.over, value).values()
-        worst = [frozen.achieved, *(frozen.close(plant, params).figures() for plant, params in others)]
+        asked, spec = self.asked_hz(value), replace(self.spec, bandwidth_hz=self.asked_hz(value))
+        frozen, loops = _freeze(self.table, value, spec, self.design, self.others)
+        measured = {loop.name: loop.figures for loop in loops}
+        others = place_plants(self.others, self.over, value).items()
+        worst = [frozen.achieved, *(measured.get(name) or frozen.close(*case).figures() for name, case in others)]
         band = frozen.achieved.bandwidth_hz
         broken = () if frozen.met else frozen.active_constraints
         if band is None or band < LEAST_BANDWIDTH * asked:
@@ -365,6 +368,13 @@ def freeze(
     """Return the controller of a table's gains at a value, judged on the plants there by all but the bandwidth asked.
     The limits that depend on the bandwidth, such as a droop up to a third of it, are those of the bandwidth it has.
     """
+    return _freeze(table, value, spec, design, others)[0]
+
+
+def _freeze(
+    table: GainTable, value: float, spec: ControllerSpec, design: tuple[Plant, ParameterSet], others: Plants
+) -> tuple[Controller, list[MeasuredLoop]]:
+    """Return the controller of a table's gains at a value with its loops on the plants there."""
     plant, params = design[0], place_variable(*design, table.over, value)
     task = make_task(plant, plant.complete(params), spec, place_plants(others, table.over, value))
     gains, law = table.find_gains(value), table.law(value)
@@ -380,7 +390,8 @@ def freeze(
         low, high = spec.bandwidth_range_hz
         reached = replace(spec, bandwidth_hz=band, bandwidth_range_hz=(min(low, band), max(high, band)))
         task = replace(task, spec=reached)
-    return describe_law(task, law, loops, (plant, params), gains=table.interpolate(value), observer=gains.observer)
+    made = describe_law(task, law, loops, (plant, params), gains=table.interpolate(value), observer=gains.observer)
+    return made, loops
 
 
 def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) -> ParameterSet:

@@ -3,8 +3,9 @@
 A law that is tuned by itself may sit in another valley than its neighbour's, with an integral a hundred times slower
 say, and lines between the two mean nothing. So one end is tuned as `seaopt.tune` does, from a scan, and every further
 point from its neighbour's numbers alone; a scan follows only where that breaks a limit. This is done from both ends,
-and the chain is taken that breaks limits at fewer points; of two that keep them, the one whose objective, over the best
-that is known at each point, is the smaller at its worst point.
+and the chain is taken that breaks limits at fewer points; of two that keep them, the one that changes its valley less
+often; of two that do so alike, the one whose objective, over the best that is known at each point, is the smaller at
+its worst point, or where both change it, the one that breaks limits at fewer values between the points.
 
 A reading that is missing from the start leaves the law without a place in the table. What counts then is the point
 whose law has the least Ms on the worst plant of all points.
@@ -12,6 +13,7 @@ whose law has the least Ms on the worst plant of all points.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -20,7 +22,7 @@ import numpy as np
 
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delays, take_own_delays
-from seaopt.control.laws.limits import MeasuredLoop
+from seaopt.control.laws.limits import INTEGRAL_RAD_S, MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.sampled_plant import DELAYS
@@ -36,7 +38,7 @@ from seaopt.control.scheduling.scheduled_controller import (
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
-from seaopt.control.tuning.law_numbers import LawNumbers, read_numbers
+from seaopt.control.tuning.law_numbers import K_I, K_P, LawNumbers, read_numbers
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import Solution, recheck, solve
 from seaopt.control.tuning.tuner import Draws, RobustTo, make_controller, make_task, tune
@@ -48,6 +50,7 @@ from seaopt.plants import Plant
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, count_off, divide, ignore
 
+ANOTHER_VALLEY = 10.0  # factor by which an integral's rate differs between two of the tuner's valleys
 Chain = list[Solution]  # of every point
 
 
@@ -61,6 +64,7 @@ def tune_schedule(
     *,
     bandwidths_hz: Sequence[float] | None = None,
     draws: Draws = (),
+    witnesses: Plants | None = None,
     near: ScheduledController | None = None,
     progress: Progress = ignore,
 ) -> ScheduledController:
@@ -87,9 +91,12 @@ def tune_schedule(
         One per point, in place of the specification's.
     draws : sequence of mappings, optional
         As in `seaopt.tune`.
+    witnesses : mapping of name to (Plant, ParameterSet), optional
+        More plants on which every plant's limits are kept at the points, such as draws; between the points the law is
+        not judged on them.
     near : ScheduledController, optional
-        The schedule of these points under other limits, or on other plants: each point is started from its gains there,
-        and not from a scan at an end.
+        A schedule of these points, or of neighbours among them, under other limits or on other plants: a point that it
+        has is started from its gains there, any other from its neighbour's, and none from a scan at an end.
     progress : callable, optional
         Called with what is done and the share of it that is done.
 
@@ -121,13 +128,14 @@ def tune_schedule(
     spec, values = settle_delays(spec, plant, params)
     responses = {name: plant for name, plant in robust_to.items() if isinstance(plant, MeasuredResponse)}
     others = _pair_plants(robust_to, values)
+    kept = {**others, **(witnesses or {})}
     if over in DELAYS:
         raise ControlError(f'over = "{over}": a delay cannot be read as the law runs; give a state or a parameter')
     if any(over in draw for draw in draws):
         raise ControlError(f'draws have "{over}", which the schedule is over; take it out of the draws')
     unit = find_unit(over, {"the design plant": plant, **{name: other for name, (other, _) in others.items()}})
     placed: list[tuple[ParameterSet, RobustTo]] = [
-        (place_variable(plant, values, over, value), place_plants(others, over, value)) for value in places.tolist()
+        (place_variable(plant, values, over, value), place_plants(kept, over, value)) for value in places.tolist()
     ]
     for name, response in responses.items():
         at = _find_point(over, places.tolist(), name, find_response_place(over, name, response, values))
@@ -137,24 +145,31 @@ def tune_schedule(
         for (at_point, at_points), point_spec in zip(placed, _specify(spec, places, bandwidths_hz), strict=True)
     ]
     tasks = [_share_nominal(task, tasks[len(tasks) // 2]) for task in tasks]
-    controllers: list[Controller] = []
-    for (at_point, at_points), task, (x, loops) in zip(
-        placed, tasks, _choose_chain(tasks, near, progress), strict=True
-    ):
-        # What blocks, and what is possible instead, is for the tuner to say; its observer would have another plant.
-        if task.nominal is None and _breaks_limits(task, loops):
-            controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws))
-        else:
-            controllers.append(make_controller(task, x, loops, (plant, at_point)))
-    make_table(over, unit, tuple(places.tolist()), tuple(controllers))  # refuses gains that cannot be interpolated
-    schedule = ScheduledController(
-        over=over,
-        unit=unit,
-        points=tuple(places.tolist()),
-        controllers=tuple(controllers),
-        others=others,
-        fallback=float(places[0]),
-    ).with_places()
+
+    def make(chain: Chain) -> ScheduledController:
+        controllers: list[Controller] = []
+        for (at_point, at_points), task, (x, loops) in zip(placed, tasks, chain, strict=True):
+            # What blocks, and what is possible instead, is for the tuner to say; its observer would have another plant.
+            if task.nominal is None and _breaks_limits(task, loops):
+                controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws))
+            else:
+                controllers.append(make_controller(task, x, loops, (plant, at_point)))
+        make_table(over, unit, tuple(places.tolist()), tuple(controllers))  # refuses gains that cannot be interpolated
+        return ScheduledController(
+            over=over,
+            unit=unit,
+            points=tuple(places.tolist()),
+            controllers=tuple(controllers),
+            others=others,
+            fallback=float(places[0]),
+        ).with_places()
+
+    best, *further = _rank_chains(tasks, None if near is None else _follow_schedule(tasks, points, near), progress)
+    schedule = make(best)
+    if _count_hops(best) and not schedule.met:
+        schedule = min(
+            [schedule, *map(make, further)], key=lambda each: sum(bool(place.broken) for place in each.between)
+        )
     progress(f"{places.size} points over {over}", 1.0)
     return replace(schedule, fallback=_choose_fallback(schedule))
 
@@ -215,13 +230,12 @@ def _share_nominal(task: Task, other: Task) -> Task:
     return replace(task, nominal=other.nominal.scaled(gain))
 
 
-def _choose_chain(tasks: Sequence[Task], near: ScheduledController | None, progress: Progress) -> Chain:
-    """Return the numbers of every point with their loops: those reached from a schedule that is near, or where these
-    break limits those of the better of the chains from either end.
+def _rank_chains(tasks: Sequence[Task], followed: Chain | None, progress: Progress) -> list[Chain]:
+    """Return the numbers of every point with their loops: those `followed`, or where there are none those of the chains
+    from either end, the better one first, and the other where it breaks limits at no more points.
     """
-    chain = None if near is None else _follow_schedule(tasks, near)
-    if chain is not None:
-        return chain
+    if followed is not None:
+        return [followed]
     forward, backward = divide(progress, 1.0, 1.0)
     chains = [_tune_chain(tasks, forward), _tune_chain(tasks[::-1], backward)[::-1]]
     values, broken = np.zeros((2, len(tasks))), [0, 0]
@@ -230,7 +244,14 @@ def _choose_chain(tasks: Sequence[Task], near: ScheduledController | None, progr
             values[k, point] = task.rank(task.grid(place_frequencies(task)), x)[1]
             broken[k] += _breaks_limits(task, loops)
     losses = np.max(values / np.min(values, axis=0), axis=1)
-    return chains[min(range(2), key=lambda k: (broken[k], losses[k]))]
+    order = sorted(range(2), key=lambda k: (broken[k], _count_hops(chains[k]), losses[k]))
+    return [chains[k] for k in order if broken[k] == broken[order[0]]]
+
+
+def _count_hops(chain: Chain) -> int:
+    """Return how often neighbours' integrals differ as those of two valleys do."""
+    rates = [max(x[K_I] / (1.0 + x[K_P]), INTEGRAL_RAD_S) for x, _ in chain]
+    return int(np.count_nonzero(np.abs(np.diff(np.log(rates))) > math.log(ANOTHER_VALLEY)))
 
 
 def _tune_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
@@ -247,17 +268,24 @@ def _tune_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
     return chain
 
 
-def _follow_schedule(tasks: Sequence[Task], near: ScheduledController) -> Chain | None:
-    """Return the numbers reached at every point from those of a schedule; None where these break a limit. What a scan
-    has at one point alone may be of another valley than its neighbours.
+def _follow_schedule(tasks: Sequence[Task], points: Sequence[float], near: ScheduledController) -> Chain | None:
+    """Return the numbers reached at every point from those of a schedule of all, or of some neighbours; None where
+    these break a limit. What a scan has at one point alone may be of another valley than its neighbours.
     """
-    chain: Chain = []
-    for task, law in zip(tasks, near.controllers, strict=True):
-        x = _follow(task, read_numbers(law.gains, task.k_ff, task.spec.sample_time_s))
-        chain.append((x, task.measure(x)))
-        if _breaks_limits(task, chain[-1][1]):
+    known = [k for k, point in enumerate(points) if point in near.points]
+    reached: dict[int, Solution] = {}
+    for k in (*known, *range(known[-1] + 1, len(tasks)), *reversed(range(known[0]))):
+        task = tasks[k]
+        if k in known:
+            gains = near.controllers[near.points.index(points[k])].gains
+            start = read_numbers(gains, task.k_ff, task.spec.sample_time_s)
+        else:
+            start = reached[k - 1 if k > known[-1] else k + 1][0]
+        x = _follow(task, start)
+        reached[k] = x, task.measure(x)
+        if _breaks_limits(task, reached[k][1]):
             return None
-    return chain
+    return [reached[k] for k in range(len(tasks))]
 
 
 def _breaks_limits(task: Task, loops: Sequence[MeasuredLoop]) -> bool:
@@ -275,5 +303,14 @@ def _choose_fallback(schedule: ScheduledController) -> float:
     """Return the point whose law has the least Ms on the worst plant of all points."""
     plants = {"": schedule.design, **schedule.others}
     cases = [pair for value in schedule.points for pair in place_plants(plants, schedule.over, value).values()]
-    worst = [max(law.close(*case).figures().ms for case in cases) for law in schedule.controllers]
-    return schedule.points[int(np.argmin(worst))]
+    chosen, least = schedule.points[0], math.inf
+    for point, law in zip(schedule.points, schedule.controllers, strict=True):
+        worst = 0.0
+        for number, case in enumerate(cases):
+            worst = max(worst, law.close(*case).figures().ms)
+            if worst >= least:
+                cases.insert(0, cases.pop(number))  # what rules out one law soon does so with the next
+                break
+        else:
+            chosen, least = point, worst
+    return chosen

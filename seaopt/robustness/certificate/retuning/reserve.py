@@ -14,6 +14,7 @@ of its own what the law is worth.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -37,11 +38,14 @@ LOOKED_AT, LOOK_STREAM = 64, 0x100C  # draws of a look, and their seed, which no
 SEARCHES = 4  # of each plant, at values of a schedule
 MS, MT = "max_sensitivity", "max_complementary"
 ROUNDS = 3  # of looking and tuning again
+PILOTS = 4  # of the same at two points, before all are tuned again
 ROOM = 1e-3  # more than what was found asks, as the next law is another
 MOST_RESERVE = 0.15  # that is given unasked: what needs more lacks points, or a term asks too much
 NEAR = 0.98  # of the limits: what uses less is no witness
 Witnesses = Mapping[str, tuple[Plant, ParameterSet]]
-Make = Callable[[ControllerSpec, Witnesses, ScheduledController | None, Progress], ScheduledController]
+Make = Callable[[ControllerSpec, Witnesses, ScheduledController | None, Sequence[float], Progress], ScheduledController]
+Looks = Mapping[str, "Look"]
+LookAt = Callable[[ScheduledController], Looks]
 
 
 @record(eq=False)
@@ -66,6 +70,27 @@ class Look:
         """The reserve with which the law alone leaves room for what uses more; 1 where that makes it unstable."""
         more = 1.0 - self.alone / self.worst.severity
         return min(more + ROOM, 1.0) if more > 1e-6 else 0.0
+
+
+@record(eq=False)
+class _Aim:
+    """What a schedule is tuned with: a specification with its reserve, and plants besides."""
+
+    spec: ControllerSpec
+    witnesses: Witnesses
+    looks: int = 0
+
+    def add(self, looks: Looks, broken: bool) -> _Aim | None:
+        """Return the same with the worst cases of a look, and the reserve that those over a limit need, or that one
+        `broken` between the points does; None where that is too much.
+        """
+        raised = raise_reserve(
+            self.spec, [each for each in looks.values() if each.is_over], RESERVE_BETWEEN if broken else 0.0
+        )
+        witnesses = dict(self.witnesses)
+        for name, each in looks.items():
+            witnesses |= list_witnesses(name, self.looks + 1, each.worst)
+        return raised and _Aim(spec=raised, witnesses=witnesses, looks=self.looks + 1)
 
 
 def look_at_draws(
@@ -113,37 +138,72 @@ def _rank_one(cases: Cases, name: str, worst: Worst) -> float:
 
 
 def keep_reserve(
-    make: Make, look: Callable[[ScheduledController], Mapping[str, Look]], spec: ControllerSpec, progress: Progress
+    make: Make, look: LookAt, spec: ControllerSpec, points: Sequence[float], progress: Progress
 ) -> ScheduledController:
     """Return a schedule that keeps its limits at the draws that are looked at, too, tuned again until it does. Where
     none does, it is the one that misses least, and a remark says by how much and where; or one that misses limits at
     its points, which says what can be had. `make` tunes with a specification, with further plants on which its limits
-    are kept, near a schedule; `look` returns the worst case of each plant.
+    are kept, near a schedule, at points; `look` returns the worst case of each plant.
     """
-    witnesses: dict[str, tuple[Plant, ParameterSet]] = {}
+    aim = _Aim(spec=spec, witnesses={})
     first, *again = divide(progress, *(1.0 for _ in range(1 + ROUNDS)))
-    kept = schedule = make(spec, witnesses, None, first)
+    kept = schedule = make(spec, {}, None, points, first)
     least, left = math.inf, dict[str, Look]()
     for number, part in enumerate((*again, None), start=1):
         if not all(each.met for each in schedule.controllers):
             return schedule
-        looks, broken = look(schedule), any(place.broken for place in schedule.between)
+        looks = look(schedule)
         over = {name: each for name, each in looks.items() if each.is_over}
+        broken = any(place.broken for place in schedule.between)
         missed = max((each.worst.severity for each in over.values()), default=0.0) + UNSTABLE * broken
         if missed >= least:
             break
         kept, least, left = schedule, missed, over
-        raised = raise_reserve(spec, over.values(), RESERVE_BETWEEN if broken else 0.0)
+        raised = aim.add(looks, broken)
         if not missed or raised is None or part is None:
             break
-        spec = raised
-        for name, each in looks.items():
-            witnesses |= list_witnesses(name, number, each.worst)
-        schedule = make(spec, witnesses, schedule, prefix(part, f"with worst cases, round {number}"))
+        tuning = prefix(part, f"with worst cases, round {number}")
+        aim, near = _pilot(make, look, raised, schedule, over, tuning)
+        schedule = make(aim.spec, aim.witnesses, near, points, tuning)
     if left:
         progress(describe_shortfall(kept, left))
     progress("worst cases looked at", 1.0)
     return kept
+
+
+def _pilot(
+    make: Make, look: LookAt, aim: _Aim, schedule: ScheduledController, over: Looks, progress: Progress
+) -> tuple[_Aim, ScheduledController]:
+    """Return what is to be aimed at, and the schedule to start from: of the two points about the worst place, tuned
+    again until draws keep their limits between the two. What that takes is what the others need, as a rule.
+    """
+    pilot = _take_stretch(schedule, over)
+    for _ in range(PILOTS if len(pilot.points) < len(schedule.points) else 0):
+        pilot = make(aim.spec, aim.witnesses, pilot, pilot.points, progress)
+        if not pilot.met:
+            break
+        looks = look(pilot)
+        if not any(each.is_over for each in looks.values()):
+            return aim, pilot
+        raised = aim.add(looks, broken=False)
+        if raised is None:
+            break
+        aim = raised
+    return aim, schedule
+
+
+def _take_stretch(schedule: ScheduledController, over: Looks) -> ScheduledController:
+    """Return the two points about the place where a schedule is worst at draws, on plants whose loops depend on it; a
+    schedule that breaks no limit there as it is.
+    """
+    if not over:
+        return schedule
+    placed = [(each.worst.severity, each.worst[1]) for each in over.values() if schedule.over in each.worst[1]]
+    _, worst = max(placed, key=lambda pair: pair[0], default=(0.0, None))
+    value = schedule.points[0] if worst is None else worst[schedule.over].value
+    first = min(bisect_right(schedule.points, value), len(schedule.points) - 1) - 1
+    pair = slice(first, first + 2)
+    return replace(schedule, points=schedule.points[pair], controllers=schedule.controllers[pair], between=())
 
 
 def describe_shortfall(schedule: ScheduledController, over: Mapping[str, Look]) -> str:
