@@ -12,6 +12,7 @@ from seaopt.control import GainTable, ScheduledController, realise, tune_schedul
 from seaopt.control.laws.structures import Gains
 from seaopt.control.scheduling.runnable_schedule import make_runnable
 from seaopt.control.scheduling.scheduled_controller import list_inner
+from seaopt.control.scheduling.tuning import _count_hops
 from seaopt.errors import ControlError, FileError
 from seaopt.files import seal, to_json
 from tests.schedules import read_knee, tune_knee
@@ -229,6 +230,39 @@ def test_a_schedule_keeps_limits_that_one_law_cannot():
         assert so.tune(stand, bent, replace(problem.spec, bandwidth_hz=hz), others).feasible is feasible
     schedule = tune_schedule(stand, values, problem.spec, "phi", points, {"swing": swing})
     assert schedule.feasible and {one.spec.bandwidth_hz for one in schedule.controllers} == {30.0}
+
+
+def test_witnesses_are_kept_at_the_points_and_the_fallback_has_the_least_ms(stand, thor):
+    """Peaks of S are those of python-control, on frequencies of the test's."""
+    spec, points = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6), [2e-6, 3e-6, 4e-6]
+    draw, z = {"k": 7.1e5, "eta": 1.04}, np.exp(2j * np.pi * np.geomspace(1.0, 499.0, 4000) * 1e-3)
+
+    def find_ms(law, params):
+        return np.max(np.abs(law.close(stand, params).to_control()(z)[0, 0]))
+
+    alone = tune_schedule(stand, thor, spec, "J", points)
+    kept = tune_schedule(stand, thor, spec, "J", points, witnesses={"draw": (stand, thor.update(**draw))}, near=alone)
+    ms = [max(find_ms(law, thor.update(J=at, **draw)) for at, law in zip(points, each.controllers, strict=True))
+          for each in (alone, kept)]  # fmt: skip
+    assert ms[0] > 1.61 and ms[1] <= 1.6 and kept.met and not kept.others
+    for schedule in (alone, kept):
+        worst = [max(find_ms(law, thor.update(J=at)) for at in points) for law in schedule.controllers]
+        assert schedule.fallback == points[int(np.argmin(worst))]
+
+
+def test_a_schedule_is_followed_from_some_of_its_points(stand, thor):
+    spec, points = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6), (2e-6, 2.7e-6, 3.4e-6, 4e-6)
+    whole = tune_schedule(stand, thor, spec, "J", points)
+    pair = replace(whole, points=points[1:3], controllers=whole.controllers[1:3], between=())
+    again = tune_schedule(stand, thor, spec, "J", points, near=pair)
+    assert again.met and again.points == points
+    for name in ("k_p", "k_i", "k_d"):
+        assert again.table.gains[name] == pytest.approx(whole.table.gains[name], rel=0.05)
+
+
+@pytest.mark.parametrize(("rates", "hops"), [([1.0, 3.0, 9.0], 0), ([60.0, 0.3, 60.0], 2), ([0.0, 0.0, 40.0], 1)])
+def test_neighbours_of_two_valleys_are_counted(rates, hops):
+    assert _count_hops([(np.array([99.0, 100.0 * rate]), []) for rate in rates]) == hops
 
 
 def test_inner_ends_are_those_of_equal_parts():

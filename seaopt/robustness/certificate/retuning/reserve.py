@@ -90,7 +90,7 @@ class _Aim:
         witnesses = dict(self.witnesses)
         for name, each in looks.items():
             witnesses |= list_witnesses(name, self.looks + 1, each.worst)
-        return raised and _Aim(spec=raised, witnesses=witnesses, looks=self.looks + 1)
+        return None if raised is None else _Aim(spec=raised, witnesses=witnesses, looks=self.looks + 1)
 
 
 def look_at_draws(
