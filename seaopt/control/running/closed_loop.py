@@ -44,7 +44,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.equations.declaration import ENERGY
 from seaopt.plants.friction import SLIDING, friction_states
-from seaopt.plants.plant import Matrices, name_input
+from seaopt.plants.plant import Matrices, dynamics_function, name_input
 from seaopt.records import record
 from seaopt.units import name_command, unit_after
 
@@ -190,14 +190,16 @@ def run_loop(
         rtol = STICKING_RTOL if loop.sticks else RTOL
     matrices = _linearise_at_rest(loop, values[0])
     substeps, before, wall_s = _first_guess(matrices[0], loop.law.sample_time_s, rtol), None, 0.0
-    motion = _bound_motion(matrices, loop.law.sample_time_s)
+    motion = _bound_motion(matrices[0], matrices[1][:, 0], loop.law.sample_time_s)
+    pushes = [_push_at_start(loop.plant, each, job.start.x[run]) for run, each in enumerate(values)]
+    unheld = np.stack([_bound_motion(matrices[0], push, loop.law.sample_time_s) for push in pushes])
     execute = make_kernel(loop, job)
     while True:
         begin = time.perf_counter()
         arrays = execute(job, substeps)
         wall_s += time.perf_counter() - begin
         kept = _first_lost_sample(arrays) == n
-        error = float(np.max(_errors(arrays, motion)[kept], initial=0.0)) / (1.0 if loop.sticks else 15.0)
+        error = float(np.max(_errors(arrays, motion, unheld)[kept], initial=0.0)) / (1.0 if loop.sticks else 15.0)
         shortest = 2 * substeps > MAX_LOOP_SUBSTEPS
         decided = bool(np.all(kept)) or (
             before is not None and bool(np.all(kept | _lose_alike(before, arrays, shortest=shortest)))
@@ -217,12 +219,14 @@ def run_loop(
         substeps, before = 2 * substeps, arrays
 
 
-def _errors(arrays: LoopArrays, motion: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " runs"]:
+def _errors(
+    arrays: LoopArrays, motion: Float[np.ndarray, " nx"], unheld: Float[np.ndarray, "runs nx"]
+) -> Float[np.ndarray, " runs"]:
     """Return the largest difference of two numbers of steps in a sample, over the state's largest value. A state that
-    rests, or that friction holds, has rounding for a value: it is measured by the largest of the others and by
-    `motion`, what an ampere would make of it in a sample without friction.
+    rests, or that friction holds, has rounding for a value: it is measured by the largest of the others, by `motion`,
+    what an ampere would make of it in a sample without friction, and by `unheld`, what the first sample would without.
     """
-    free = motion * np.max(np.abs(arrays.applied), axis=1, keepdims=True, initial=0.0)
+    free = motion * np.max(np.abs(arrays.applied), axis=1, keepdims=True, initial=0.0) + unheld
     with np.errstate(invalid="ignore"):
         size = np.maximum(arrays.size, RESTS * np.maximum(free, np.max(arrays.size, axis=1, keepdims=True)))
         scale = np.where(size > 0.0, size, 1.0)
@@ -338,9 +342,15 @@ def _first_guess(a: Float[np.ndarray, "nx nx"], period: float, rtol: float) -> i
     return int(np.clip(math.ceil(0.5 * steps), 1, 64))
 
 
-def _bound_motion(matrices: Matrices, period: float) -> Float[np.ndarray, " nx"]:
-    """Return about how far the command moves each state in a sample, per unit: three terms of its Taylor series."""
-    a, b = matrices[0], matrices[1][:, 0]
+def _push_at_start(plant: Plant, params: CompletedParameters, x: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " nx"]:
+    """Return the rates of the states at the start, without a command: what friction there holds, such as cogging."""
+    return np.array(dynamics_function(plant)(x, np.zeros(len(plant.inputs)), params.vector)).ravel()
+
+
+def _bound_motion(
+    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], period: float
+) -> Float[np.ndarray, " nx"]:
+    """Return about how far rates b move each state in a sample: three terms of a Taylor series."""
     with np.errstate(over="ignore", invalid="ignore"):  # a plant beyond computing has no motion to measure by
         terms = [np.abs(np.linalg.matrix_power(a, k) @ b) * period ** (k + 1) / math.factorial(k + 1) for k in range(3)]
         return np.nan_to_num(np.sum(terms, axis=0), nan=0.0, posinf=0.0)

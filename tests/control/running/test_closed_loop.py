@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control.laws.realisation import realise
+from seaopt.control.laws.realisation import realise, runnable
 from seaopt.control.running.closed_loop import LoopState, SampledLoop, at_rest, run_loop
 from seaopt.control.running.force_run import close_loop
 from seaopt.control.running.sampled_loop import largest_current
@@ -319,3 +319,13 @@ def test_bad_runs(stand, thor):
 def test_the_largest_current_is_a_whole_step():
     assert largest_current(9.0, 0.07) == pytest.approx(8.96)
     assert largest_current(9.0, 0.0) == 9.0
+
+
+def test_a_motor_that_friction_holds_against_its_cogging_stands_still():
+    """Nothing is commanded, and the push is a third of the friction: what moves is rounding, which has no accuracy."""
+    plant = so.plants.rotary(link="locked", parts=("cogging",))
+    params = plant.defaults.update(J_m=3e-5, b_r=2e-4, K_tau=0.06, N=60.0, k_s=250.0, f_c=0.02, b_g=0.006, n_g=42.0)
+    controller = so.tune(plant, params, so.ControllerSpec(measured="tau_s", bandwidth_hz=20, max_sensitivity=1.7))
+    loop = SampledLoop(plant=plant, law=runnable(controller), measured="tau_s", delay_samples=1, sticks=True)
+    run = run_loop(loop, [params], np.zeros(100))
+    assert np.max(np.abs(run.states[..., list(plant.states).index("theta_m")])) < 1e-8
