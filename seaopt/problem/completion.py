@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -23,6 +23,7 @@ from seaopt.control import (
     critical_impedance,
 )
 from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.scheduling.scheduled_controller import PARTS, list_inner, place_variable
 from seaopt.errors import ControlError, ProblemError
@@ -41,6 +42,19 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
     (controller,) = add_outer_loop(problem, [(controller, values)])
     controller, terms = _guard(problem, controller, source), _list_terms(problem, values)
     return add_compensation(controller, **terms) if terms else controller
+
+
+def find_outer(problem: Problem, source: Fit | ParameterSet) -> Callable[[Any], OuterLoop | None] | None:
+    """Return what says with which outer loop a tuned law, or a schedule, is to run; None where the file has none."""
+    if problem.table.impedance is None:
+        return None
+
+    def surround(law: Controller | ScheduledController) -> OuterLoop | None:
+        if isinstance(law, ScheduledController):
+            return _surround_schedule(problem, law, source)[0].outer
+        return add_outer_loop(problem, [(law, problem.values(source))])[0].outer
+
+    return surround
 
 
 def add_outer_loop(
@@ -99,18 +113,20 @@ def complete_schedule(
     """Return a schedule with the problem's guards, the gate's step that of the point where the plant moves the
     furthest, and with what it compensates.
     """
-    values = problem.values(source)
-    link = (
-        problem.plants[problem.table.impedance.plant] if problem.table.impedance is not None else problem.design_plant
-    )
-    place = partial(place_variable, link, values, schedule.over)
-    between = ((schedule.at(value), place(value)) for value in list_inner(schedule.points, PARTS))
-    laws = add_outer_loop(problem, list(zip(schedule.controllers, map(place, schedule.points), strict=True)), between)
-    guarded = [_guard(problem, controller, source) for controller in laws]
+    guarded = [_guard(problem, controller, source) for controller in _surround_schedule(problem, schedule, source)]
     gate = _join_gates(problem, schedule, [controller.gate for controller in guarded if controller.gate is not None])
     guarded = replace(schedule, controllers=tuple(replace(each, gate=gate) for each in guarded))
-    terms = _list_terms(problem, values)
+    terms = _list_terms(problem, problem.values(source))
     return compensate_schedule(guarded, **terms) if terms else guarded
+
+
+def _surround_schedule(problem: Problem, schedule: ScheduledController, source: Fit | ParameterSet) -> list[Controller]:
+    """Return a schedule's controllers with the problem's outer loop."""
+    values, outer = problem.values(source), problem.table.impedance
+    link = problem.design_plant if outer is None else problem.plants[outer.plant]
+    place = partial(place_variable, link, values, schedule.over)
+    between = ((schedule.at(value), place(value)) for value in list_inner(schedule.points, PARTS))
+    return add_outer_loop(problem, list(zip(schedule.controllers, map(place, schedule.points), strict=True)), between)
 
 
 def _join_gates(

@@ -35,7 +35,14 @@ from seaopt.frequency import MeasuredResponse
 from seaopt.logs import Log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.problem.completion import add_outer_loop, complete_controller, complete_schedule, derates, make_gate
+from seaopt.problem.completion import (
+    add_outer_loop,
+    complete_controller,
+    complete_schedule,
+    derates,
+    find_outer,
+    make_gate,
+)
 from seaopt.problem.problem import WRITE_ONE, Problem
 from seaopt.progress import Progress, ignore
 from seaopt.robustness import (
@@ -186,6 +193,7 @@ def tune_problem(
     values, schedule, table = problem.values(source), problem.schedule, problem.robustness
     rounds = table.retune
     scheduled: dict[str, Any] = {}
+    outer = find_outer(problem, source)
     if schedule is not None:
         scheduled = {"over": schedule.over, "points": schedule.points, "bandwidths_hz": schedule.bandwidth_hz}
     if schedule is not None and not rounds:
@@ -202,7 +210,8 @@ def tune_problem(
                 schedule.points
             )  # a measured response has its place, where a pilot may have no point
             kept = {name: at for name, at in robust_to.items() if whole or not isinstance(at, MeasuredResponse)}
-            options: dict[str, Any] = {"draws": draws, "witnesses": witnesses, "near": near, "progress": part}
+            options: dict[str, Any] = {"draws": draws, "witnesses": witnesses, "near": near, "outer": outer}
+            options["progress"] = part
             tuned = tune_schedule(
                 problem.design_plant, values, asked, schedule.over, points, kept, bandwidths_hz=bands, **options
             )
@@ -212,7 +221,7 @@ def tune_problem(
             return make(spec, {}, None, schedule.points, progress)
         return keep_reserve(make, partial(_look, problem, source=source), spec, schedule.points, progress)
     if not rounds:
-        tuned = tune(design, values, spec, robust_to, draws=draws, progress=progress)
+        tuned = tune(design, values, spec, robust_to, draws=draws, outer=outer, progress=progress)
         tuned = complete_controller(problem, tuned, source)
         if rounds == 0 or not _needs_reserve(problem, tuned, source):
             return tuned
@@ -295,7 +304,8 @@ def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet
     values = problem.values(source, spec)
     design, robust_to = list_plants(problem, source, spec)
     law = given.to_effort(command_of(problem.design_plant, values, spec.regulated).per_effort)
-    controller = assess(law, design, values, spec, robust_to, draws=problem.draws(source))
+    outer = find_outer(problem, source)
+    controller = assess(law, design, values, spec, robust_to, draws=problem.draws(source), outer=outer)
     return complete_controller(problem, controller, source)
 
 

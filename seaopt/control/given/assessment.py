@@ -11,6 +11,8 @@ from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.law import Law, count_filter_samples, find_integral_rate
 from seaopt.control.loops.sampled_plant import find_signals, list_names
+from seaopt.control.tuning.found_law import Surround
+from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.tuner import Draws, RobustTo, describe_law, make_task, name_design
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
@@ -29,6 +31,7 @@ def assess(
     robust_to: RobustTo | None = None,
     *,
     draws: Draws = (),
+    outer: Surround | None = None,
 ) -> Controller:
     """Measure a law of one's own against a specification; the controller that it makes is certified and exported alike.
 
@@ -43,7 +46,7 @@ def assess(
     spec : ControllerSpec
         Limits, and the bandwidth that the law should have at least; its structure, notch, prefilter,
         link_feedforward and reference_weights are those of no law, and its sample rate must be the law's.
-    robust_to, draws
+    robust_to, draws, outer
         As in `tune`.
 
     Returns
@@ -89,5 +92,11 @@ def assess(
     spec, values = settle_delays(spec, design, params)
     spec = replace(spec, structure=CUSTOM, notch=None, prefilter=None, link_feedforward=None, reference_weights="tuned")
     task = make_task(plant, design.complete(values), spec, robust_to, draws)
-    loops = task.measure_law(law, filter_samples=count_filter_samples(law), integral_rad_s=find_integral_rate(law))
-    return describe_law(task, law, loops, (plant, values), gains={})
+
+    def describe(task: Task) -> Controller:
+        loops = task.measure_law(law, filter_samples=count_filter_samples(law), integral_rad_s=find_integral_rate(law))
+        return describe_law(task, law, loops, (plant, values), gains={})
+
+    controller = describe(task)
+    around = None if outer is None else outer(controller)
+    return controller if around is None else describe(task.enclosed(around, controller.command.per_effort))

@@ -508,8 +508,14 @@ class Controller(ClosesLoops, Result, Worded):
         check_achieved(content["achieved"], controller._prefilter_figures())
         loops = [controller.design_loop]
         if controller.design is not None:
-            states = controller.measure_states().items()
-            first, *stuck = (controller.measure(f"design plant{state}", figures) for state, figures in states)
+            states = controller.measure_states()
+            if controller.outer is not None:
+                from seaopt.control.laws.outer_run import close_outer  # deferred: it knows controllers
+
+                models = split_friction({"": controller.design[0]}, controller.design[1]).values()
+                wholes = (close_outer(controller, model, controller.design[1]).figures() for model in models)
+                states = {name: states[name].with_margins(whole) for name, whole in zip(states, wholes, strict=True)}
+            first, *stuck = (controller.measure(f"design plant{state}", each) for state, each in states.items())
             loops = [controller._add_friction(first), *stuck]
         broken = tuple(list_broken_figures(spec, loops) if controller.met else ())
         return replace(controller, met=False, active_constraints=broken, blocked_by=broken) if broken else controller

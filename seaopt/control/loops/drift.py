@@ -33,6 +33,7 @@ from seaopt.signals import MatrixMN, MatrixNN, VectorN
 
 PLACES = 4  # states, inputs and parameters at random where the equations are looked at
 SEED = 1
+FORGOTTEN = 1e-4  # of what drifts, in a period, where its differences alone are read
 ROUNDING = 1e-9  # of a column's size
 CANCELLED = 1e-13  # of a row's largest slope
 
@@ -170,3 +171,18 @@ def _take_out(plant: Plant, shifts: Mapping[str, Any], telling: set[str]) -> Pla
         outputs={name: unit for name, unit in plant.outputs.items() if name not in telling},
         friction={name: relative(friction) for name, friction in plant.friction.items()},
     )
+
+
+def add_forgetful(plant: Plant, output: str, rate: float, state: str) -> Plant:
+    """Return a plant with one more state, which moves as an output does and forgets at a rate (1/s) where it is."""
+    at = plant.output[list(plant.outputs).index(output)]
+    speed = ca.Function("speed", [*plant.symbols], [ca.jtimes(at, plant.x, plant.dynamics)])
+
+    def f(t: Any, x: Any, u: Any, p: Any) -> dict[str, Any]:
+        vectors = (
+            ca.vertcat(*(getattr(space, name) for name in names))
+            for space, names in ((x, plant.states), (u, plant.inputs), (p, plant.parameters))
+        )
+        return {**plant.f(t, x, u, p), state: speed(t, *vectors) - rate * getattr(x, state)}
+
+    return replace(plant, f=f, states={**plant.states, state: plant.outputs[output]})

@@ -10,6 +10,7 @@ crossings come from the eigenvalues of level sets (`response`, `peaks`), so that
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,6 +99,14 @@ class LoopFigures:
     disk_margin: float = 0.0
     noise_gain: float = np.inf
     other_noise_gains: tuple[float, ...] = ()
+
+    def with_margins(self, other: LoopFigures) -> LoopFigures:
+        """Return these figures with another loop's stability, peaks and margins; without stability those of neither."""
+        names = (
+            "stable", "spectral_radius", "crossover_hz", "ms", "mt", "ms_hz", "gain_margin_db", "phase_margin_deg",
+            "delay_margin_s", "disk_margin",
+        )  # fmt: skip
+        return replace(self, **{name: getattr(other, name) for name in names})
 
     @property
     def delay_margin_ms(self) -> float | None:

@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 
 from seaopt.codec import OrInfinite, to_content
-from seaopt.control.laws.command import Command
+from seaopt.control.laws.command import Command, command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import MeasuredLoop
+from seaopt.control.laws.outer_run import close_outer
 from seaopt.control.laws.realisation import choose_limit
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.loop import Loop
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
@@ -191,11 +193,11 @@ class ScheduledController(Result, Worded):
             frozen = self.controllers[self.points.index(value)]
         else:
             spec, first = replace(self.spec, bandwidth_hz=self.asked_hz(value)), self.controllers[0]
-            frozen = freeze(self.table, value, spec, self.design, self.others)
+            frozen = freeze(self.table, value, spec, self.design, self.others, first.outer)
             (i, t), terms = self.table.find_stretch(value), [each.compensation for each in self.controllers]
             low, high = terms[i], terms[i + 1]
             mixed = None if low is None or high is None else low.mix(high, t)
-            kept = {"outer": first.outer, "gate": first.gate, "derate": first.derate}
+            kept = {"gate": first.gate, "derate": first.derate}
             frozen = replace(frozen, compensation=mixed, **kept)
         if value in self.points and not self.table.nominals:
             return frozen
@@ -213,10 +215,11 @@ class ScheduledController(Result, Worded):
     def _judge_place(self, value: float) -> PlaceFigures:
         """Judge the law at a value between the points: all limits, and 0.9 of the bandwidth that is asked there."""
         asked, spec = self.asked_hz(value), replace(self.spec, bandwidth_hz=self.asked_hz(value))
-        frozen, loops = _freeze(self.table, value, spec, self.design, self.others)
+        frozen, loops = _freeze(self.table, value, spec, self.design, self.others, self.controllers[0].outer)
         measured = {loop.name: loop.figures for loop in loops}
         others = place_plants(self.others, self.over, value).items()
-        worst = [frozen.achieved, *(measured.get(name) or frozen.close(*case).figures() for name, case in others)]
+        closed = (measured.get(name) or close_outer(frozen, *case).figures() for name, case in others)
+        worst = [loops[0].figures, *closed]
         band = frozen.achieved.bandwidth_hz
         broken = () if frozen.met else frozen.active_constraints
         if band is None or band < LEAST_BANDWIDTH * asked:
@@ -363,23 +366,35 @@ def is_alike(terms: Compensation | None, others: Compensation | None) -> bool:
 
 
 def freeze(
-    table: GainTable, value: float, spec: ControllerSpec, design: tuple[Plant, ParameterSet], others: Plants
+    table: GainTable,
+    value: float,
+    spec: ControllerSpec,
+    design: tuple[Plant, ParameterSet],
+    others: Plants,
+    outer: OuterLoop | None = None,
 ) -> Controller:
     """Return the controller of a table's gains at a value, judged on the plants there by all but the bandwidth asked.
     The limits that depend on the bandwidth, such as a droop up to a third of it, are those of the bandwidth it has.
+    `outer` runs around it.
     """
-    return _freeze(table, value, spec, design, others)[0]
+    return _freeze(table, value, spec, design, others, outer)[0]
 
 
 def _freeze(
-    table: GainTable, value: float, spec: ControllerSpec, design: tuple[Plant, ParameterSet], others: Plants
+    table: GainTable,
+    value: float,
+    spec: ControllerSpec,
+    design: tuple[Plant, ParameterSet],
+    others: Plants,
+    outer: OuterLoop | None,
 ) -> tuple[Controller, list[MeasuredLoop]]:
     """Return the controller of a table's gains at a value with its loops on the plants there."""
     plant, params = design[0], place_variable(*design, table.over, value)
     task = make_task(plant, plant.complete(params), spec, place_plants(others, table.over, value))
     gains, law = table.find_gains(value), table.law(value)
     task = feed_link(task, gains.link)
-
+    if outer is not None:
+        task = task.enclosed(outer, command_of(plant, params, spec.regulated).per_effort)
     loops = task.measure_law(
         law,
         filter_samples=gains.T_f / table.sample_time_s if gains.k_d else math.inf,

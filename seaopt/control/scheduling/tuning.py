@@ -14,7 +14,7 @@ whose law has the least Ms on the worst plant of all points.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,8 +23,10 @@ import numpy as np
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delays, take_own_delays
 from seaopt.control.laws.limits import INTEGRAL_RAD_S, MeasuredLoop
+from seaopt.control.laws.outer_run import close_outer
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import list_broken_limits
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DELAYS
 from seaopt.control.scheduling.gain_table import check_points, check_structure
 from seaopt.control.scheduling.scheduled_controller import (
@@ -36,13 +38,14 @@ from seaopt.control.scheduling.scheduled_controller import (
     place_variable,
 )
 from seaopt.control.tuning.convex_concave import improve
+from seaopt.control.tuning.found_law import OUTER_ROUNDS
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.law_numbers import K_I, K_P, LawNumbers, read_numbers
 from seaopt.control.tuning.optimisation_problem import Task
-from seaopt.control.tuning.solution import Solution, recheck, solve
+from seaopt.control.tuning.solution import Solution, follow_task, recheck, solve
 from seaopt.control.tuning.tuner import Draws, RobustTo, make_controller, make_task, tune
-from seaopt.errors import ControlError, require_type
+from seaopt.errors import ControlError, SeaoptError, require_type
 from seaopt.estimation import Fit
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
@@ -66,6 +69,7 @@ def tune_schedule(
     draws: Draws = (),
     witnesses: Plants | None = None,
     near: ScheduledController | None = None,
+    outer: Callable[[ScheduledController], OuterLoop | None] | None = None,
     progress: Progress = ignore,
 ) -> ScheduledController:
     """Tune a controller per point of a scheduling variable, with gains that are interpolated between the points.
@@ -97,6 +101,8 @@ def tune_schedule(
     near : ScheduledController, optional
         A schedule of these points, or of neighbours among them, under other limits or on other plants: a point that it
         has is started from its gains there, any other from its neighbour's, and none from a scan at an end.
+    outer : callable, optional
+        Returns the one outer loop that a schedule is to run with, or None; as in `seaopt.tune`.
     progress : callable, optional
         Called with what is done and the share of it that is done.
 
@@ -146,12 +152,14 @@ def tune_schedule(
     ]
     tasks = [_share_nominal(task, tasks[len(tasks) // 2]) for task in tasks]
 
-    def make(chain: Chain) -> ScheduledController:
+    def make(tasks: Sequence[Task], chain: Chain) -> ScheduledController:
+        """Return the schedule of a chain."""
         controllers: list[Controller] = []
         for (at_point, at_points), task, (x, loops) in zip(placed, tasks, chain, strict=True):
             # What blocks, and what is possible instead, is for the tuner to say; its observer would have another plant.
             if task.nominal is None and _breaks_limits(task, loops):
-                controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws))
+                around = None if task.moved is None else _give(task.moved.outer)
+                controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws, outer=around))
             else:
                 controllers.append(make_controller(task, x, loops, (plant, at_point)))
         make_table(over, unit, tuple(places.tolist()), tuple(controllers))  # refuses gains that cannot be interpolated
@@ -164,14 +172,56 @@ def tune_schedule(
             fallback=float(places[0]),
         ).with_places()
 
-    best, *further = _rank_chains(tasks, None if near is None else _follow_schedule(tasks, points, near), progress)
-    schedule = make(best)
-    if _count_hops(best) and not schedule.met:
-        schedule = min(
-            [schedule, *map(make, further)], key=lambda each: sum(bool(place.broken) for place in each.between)
+    alone, around = divide(progress, 1.0, 1.0 * (outer is not None))
+    chain, *further = _rank_chains(tasks, None if near is None else _follow_schedule(tasks, points, near), alone)
+    schedule = make(tasks, chain)
+    if _count_hops(chain) and not schedule.met:
+        schedule, chain = min(
+            [(schedule, chain), *((make(tasks, each), each) for each in further)],
+            key=lambda made: sum(bool(place.broken) for place in made[0].between),
         )
+    if outer is not None:
+        schedule = _meet_outer(tasks, chain, schedule, make, outer, around)
     progress(f"{places.size} points over {over}", 1.0)
     return replace(schedule, fallback=_choose_fallback(schedule))
+
+
+def _give(outer: OuterLoop) -> Callable[[Controller], OuterLoop]:
+    return lambda _: outer
+
+
+def _meet_outer(
+    tasks: Sequence[Task],
+    chain: Chain,
+    schedule: ScheduledController,
+    make: Callable[[Sequence[Task], Chain], ScheduledController],
+    outer: Callable[[ScheduledController], OuterLoop | None],
+    progress: Progress,
+) -> ScheduledController:
+    """Return a schedule that keeps its limits with the outer loop that it gets, from one that was found without, as
+    `seaopt.tune` does a law: each point from its own numbers, and where that breaks a limit all from a scan.
+    """
+    for number in range(OUTER_ROUNDS + 1):
+        try:
+            asked = outer(schedule)
+        except SeaoptError:
+            if schedule.met:
+                raise
+            return schedule
+        if asked is None or asked == schedule.controllers[0].outer:
+            return schedule
+        tasks = [task.enclosed(asked, schedule.command.per_effort) for task in tasks]
+        chain = [(x, task.measure(x)) for task, (x, _) in zip(tasks, chain, strict=True)]
+        broken = _list_missed(tasks, chain)
+        if broken and number < OUTER_ROUNDS:
+            for k in broken:
+                chain[k] = follow_task(tasks[k], *chain[k])
+            if number == 0 and _list_missed(tasks, chain):
+                chain = _rank_chains(tasks, None, progress)[0]
+        schedule = make(tasks, chain)
+        if not broken:
+            break
+    return schedule
 
 
 def _pair_plants(robust_to: Mapping[str, Any], values: ParameterSet) -> Plants:
@@ -288,6 +338,11 @@ def _follow_schedule(tasks: Sequence[Task], points: Sequence[float], near: Sched
     return [reached[k] for k in range(len(tasks))]
 
 
+def _list_missed(tasks: Sequence[Task], chain: Chain) -> list[int]:
+    """Return the points at which a limit is broken."""
+    return [k for k, (task, (_, loops)) in enumerate(zip(tasks, chain, strict=True)) if _breaks_limits(task, loops)]
+
+
 def _breaks_limits(task: Task, loops: Sequence[MeasuredLoop]) -> bool:
     return bool(list_broken_limits(task.spec, loops, task.design_states))
 
@@ -307,7 +362,7 @@ def _choose_fallback(schedule: ScheduledController) -> float:
     for point, law in zip(schedule.points, schedule.controllers, strict=True):
         worst = 0.0
         for number, case in enumerate(cases):
-            worst = max(worst, law.close(*case).figures().ms)
+            worst = max(worst, close_outer(law, *case).figures().ms)
             if worst >= least:
                 cases.insert(0, cases.pop(number))  # what rules out one law soon does so with the next
                 break

@@ -38,7 +38,7 @@ from jaxtyping import Complex, Float
 from seaopt.control.tuning.frequencies import choose_prominent
 from seaopt.control.tuning.grid import FRICTION, Curve, Grid, Indices, LawResponse, Path, Usage, Values, use_disc
 from seaopt.control.tuning.law_numbers import K_D, K_P, K_V, LawNumbers
-from seaopt.control.tuning.optimisation_problem import CURVES, NEXT_TO_NO_NOISE, PASSIVE, Task
+from seaopt.control.tuning.optimisation_problem import CURVES, NEXT_TO_NO_NOISE, PASSIVE, SCOPES, Task
 from seaopt.records import record
 from seaopt.signals import ComplexN, MatrixMN, MatrixNN
 
@@ -169,16 +169,22 @@ def _change_path(
     path: Path, law: _Affine, column: Indices
 ) -> tuple[Complex[np.ndarray, "c ..."], Complex[np.ndarray, "g c ..."]]:
     """Return a path's sums at c points, of one row or one per signal, and their derivatives by the g gains."""
-    c_y, c_v, by_y, by_v = law.law.c_y[column], law.law.c_v[column], law.by_y[:, column], law.by_v[:, column]
+    at = [part[column] for part in (law.law.c_y, law.law.c_v, law.law.c_r)]
+    by = [part[:, column] for part in (law.by_y, law.by_v, law.by_r)]
     if path.y.ndim > 1:
-        c_y, c_v, by_y, by_v = (part[..., None] for part in (c_y, c_v, by_y, by_v))
-    return path.add_up(c_y, c_v), path.change(by_y, by_v)
+        at, by = ([part[..., None] for part in parts] for parts in (at, by))
+    return path.add_up(*at), path.change(*by)
+
+
+def _take_path(grid: Grid, name: str) -> Path:
+    """Return the plants as a limit is asked of them: of the design plant with the force law alone."""
+    return grid.plants.alone if name in SCOPES["design plant"] else grid.plants
 
 
 def _differentiate_curve(grid: Grid, law: _Affine, name: str, index: Indices) -> tuple[PointSlopes, PointSlopes]:
     """Return the derivatives of ln abs(1 + L) and of ln abs(X) of a limit by the gains, at points of plants."""
     at, curve, (row, column) = law.law, CURVES[name], np.divmod(index, grid.f.size)
-    path = grid.plants.at((row, column))
+    path = _take_path(grid, name).at((row, column))
     distance, by_loop = _change_path(path, law, column)
     by_y, by_r, by_v = (by[:, column] for by in (law.by_y, law.by_r, law.by_v))
     near = _differentiate_size(distance, by_loop) / np.abs(distance)[:, None]
@@ -198,8 +204,8 @@ def choose_near(usage: Usage) -> Indices:
 def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) -> PointSlopes:
     """Return the derivative of a limit's usage by the gains at points in discs, by central differences."""
     curve, (row, column) = CURVES[name], np.divmod(index, grid.f.size)
-    path, discs, level = grid.plants.at((row, column)), grid.discs[row, column], grid.levels[name][column]
-    p, rest = path.y, path.add_rest(law.law.c_v[column])
+    path, discs = _take_path(grid, name).at((row, column)), grid.discs[row, column]
+    p, level, c_v = path.y, grid.levels[name][column], law.law.c_v[column]
     slope = np.zeros((index.size, len(law.by_y)))
     for k in range(len(law.by_y)):
         by_y, by_r = law.by_y[k, column], law.by_r[k, column]
@@ -208,14 +214,14 @@ def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) ->
         ends: list[Float[np.ndarray, " c"]] = []
         for sign in (1.0, -1.0):
             c_y, c_r = (c[column] + sign * step * by for c, by in ((law.law.c_y, by_y), (law.law.c_r, by_r)))
-            ends.append(use_disc(curve, level, p, discs, c_y, c_r, rest))
+            ends.append(use_disc(curve, level, p, discs, c_y, c_r, path.add_rest(c_v, c_r)))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     return slope
 
 
 def _linearise_bandwidth(task: Task, grid: Grid, law: _Affine) -> Rows:
     at = np.array([task.find_bandwidth(grid)])
-    path = grid.plants.at((0, at))
+    path = grid.plants.alone.at((0, at))
     distance, by_loop = _change_path(path, law, at)
     through = path.y * law.law.c_r[at]
     slope = _differentiate_size(through, path.y * law.by_r[:, at]) / np.abs(through)
@@ -228,9 +234,10 @@ def _expand_objective(task: Task, grid: Grid, law: _Affine) -> tuple[Float[np.nd
     """Return curvature, values and slopes of the functions whose largest is the objective, over its present value."""
     at, count = law.law, len(law.by_y)
     if task.spec.objective == "noise":
-        noise = np.abs(at.c_y / grid.plants.at(0).add_up(at.c_y, at.c_v))
+        design = grid.plants.alone.at(0)
+        noise = np.abs(at.c_y / design.add_up(at.c_y, at.c_v, at.c_r))
         index = choose_prominent(noise[None] / max(np.max(noise), NEXT_TO_NO_NOISE), ROWS_PER_LIMIT)
-        (distance, by_loop), used = _change_path(grid.plants.at((0, index)), law, index), noise[index]
+        (distance, by_loop), used = _change_path(design.at(index), law, index), noise[index]
         by_size = _differentiate_size(at.c_y[index], law.by_y[:, index])
         slope = by_size - used[:, None] * _differentiate_size(distance, by_loop)
         size = max(np.max(used), NEXT_TO_NO_NOISE)
@@ -238,7 +245,7 @@ def _expand_objective(task: Task, grid: Grid, law: _Affine) -> tuple[Float[np.nd
     w = task.weights(grid.f)
     inside = w > 0.0
     plants = grid.plants.at((slice(None), inside))
-    distance = plants.add_up(at.c_y[inside], at.c_v[inside])
+    distance = plants.add_up(at.c_y[inside], at.c_v[inside], at.c_r[inside])
     rho = np.abs(distance)
     values = (1.0 / rho) @ w[inside]
     size, worst = np.max(values), int(np.argmax(values))
@@ -246,6 +253,8 @@ def _expand_objective(task: Task, grid: Grid, law: _Affine) -> tuple[Float[np.nd
     along = np.real((unit * plants.y)[:, None] * law.by_y[None, :, inside])
     if task.speed_loop is not None:
         along += np.real((unit * plants.v)[:, None] * law.by_v[None, :, inside])
+    if plants.r is not None:
+        along += np.real((unit * plants.r)[:, None] * law.by_r[None, :, inside])
     slopes = -np.einsum("nkm,nm,m->nk", along, rho**-2, w[inside])
     curvature = 2.0 * np.einsum("km,lm,m,m->kl", along[worst], along[worst], rho[worst] ** -3, w[inside])
     return curvature / size, values / size, slopes / size

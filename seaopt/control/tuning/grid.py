@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,11 +10,14 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from seaopt.control.laws.limits import LimitCurve
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.structures import SpeedLoop
+from seaopt.control.loops.absolute_stability import LOWEST_ANGLE, limit_feedback
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.measured.loop import bound_disc
 from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.sampled_plant import DigitalPlant
-from seaopt.control.loops.transfer_function import Frequencies, Response
+from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
 from seaopt.plants import Plant
 from seaopt.plants.friction import Friction
 from seaopt.records import record
@@ -27,32 +30,72 @@ Values = Float[np.ndarray, " n"]
 Indices = Int[np.ndarray, " c"]
 
 FRICTION = "min_friction_margin"
+MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hundredth, and looks between angles
 LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have none
 
 
 @record(eq=False)
 class Path:
-    """A sum over the signals that a law reads, affine in its feedback: fixed + y C_y + v C_v, C_v of a speed loop."""
+    """A sum over the signals that a law reads, affine in it: fixed + y C_y + v C_v + r C_r, C_v of a speed loop, and r
+    what an outer loop takes off the reference; None where no outer loop is closed.
+    """
 
     fixed: ComplexArray
     y: ComplexArray
     v: ComplexArray
+    r: ComplexArray | None = None
 
-    def add_rest(self, c_v: ComplexArray) -> ComplexArray:
+    def add_rest(self, c_v: ComplexArray, c_r: ComplexArray) -> ComplexArray:
         """Return the sum without the regulated signal."""
-        return self.fixed + self.v * c_v
+        rest = self.fixed + self.v * c_v
+        return rest if self.r is None else rest + self.r * c_r
 
-    def add_up(self, c_y: ComplexArray, c_v: ComplexArray) -> ComplexArray:
+    def add_up(self, c_y: ComplexArray, c_v: ComplexArray, c_r: ComplexArray) -> ComplexArray:
         """Return the sum of a law."""
-        return self.add_rest(c_v) + self.y * c_y
+        return self.add_rest(c_v, c_r) + self.y * c_y
 
-    def change(self, by_y: ComplexArray, by_v: ComplexArray) -> ComplexArray:
-        """Return the change of the sum with those of C_y and C_v."""
-        return self.y * by_y + self.v * by_v
+    def change(self, by_y: ComplexArray, by_v: ComplexArray, by_r: ComplexArray) -> ComplexArray:
+        """Return the change of the sum with those of C_y, C_v and C_r."""
+        change = self.y * by_y + self.v * by_v
+        return change if self.r is None else change + self.r * by_r
 
     def at(self, index: Any) -> Path:
         """Return some of the frequencies, or rows and frequencies."""
-        return Path(fixed=self.fixed[index], y=self.y[index], v=self.v[index])
+        return Path(
+            fixed=self.fixed[index], y=self.y[index], v=self.v[index], r=None if self.r is None else self.r[index]
+        )
+
+    @property
+    def alone(self) -> Path:
+        """The sum of the force law alone."""
+        return self if self.r is None else replace(self, r=None)
+
+
+def stack_paths(paths: Sequence[Path]) -> Path:
+    """Return the paths of plants as rows of one."""
+    parts = ("fixed", "y", "v") if paths[0].r is None else ("fixed", "y", "v", "r")
+    return Path(**{part: np.array([getattr(path, part) for path in paths]) for part in parts})
+
+
+def feed_back(
+    signals: Complex[np.ndarray, "... y m"],
+    start: float,
+    further: Sequence[TransferFunction | SpeedLoop],
+    f: Frequencies,
+    ts: float,
+) -> Path:
+    """Return a number and a weighted sum over the signals fed back, of one row per signal: the regulated one, and those
+    that further paths feed back.
+    """
+    y = signals[..., 0, :]
+    v = np.zeros_like(y)
+    fixed = v + start
+    for row, path in enumerate(further, start=1):
+        if isinstance(path, SpeedLoop):
+            v = signals[..., row, :]
+        else:
+            fixed = fixed + signals[..., row, :] * path.response(f, ts)
+    return Path(fixed=fixed, y=y, v=v)
 
 
 @record(eq=False)
@@ -121,8 +164,9 @@ def use_friction(grid: Grid, law: LawResponse) -> dict[str, np.ndarray]:
     if not grid.friction.y.size:
         return {}
     c_y, c_v = law.c_y[..., None, :], law.c_v[..., None, :]
-    size = np.linalg.norm(grid.friction_size.add_up(c_y[..., None, :], c_v[..., None, :]), axis=-2)
-    return {FRICTION: size / np.maximum(np.abs(grid.friction.add_up(c_y, c_v)), 1e-300)}
+    c_r = law.c_r[..., None, :]
+    size = np.linalg.norm(grid.friction_size.add_up(c_y[..., None, :], c_v[..., None, :], c_r[..., None, :]), axis=-2)
+    return {FRICTION: size / np.maximum(np.abs(grid.friction.add_up(c_y, c_v, c_r)), 1e-300)}
 
 
 def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Frequencies) -> Curve:
@@ -144,3 +188,20 @@ class PlantWithFriction:
         """Return the friction that falls most with speed, and how steeply."""
         steepest = int(np.argmin(self.flattest))
         return list(self.model.friction.values())[steepest], -float(self.flattest[steepest])
+
+
+def weigh_friction(
+    aimed: PlantWithFriction, spec: ControllerSpec, count: int, f: Frequencies
+) -> tuple[Complex[np.ndarray, "y m"], Complex[np.ndarray, "y y m"]]:
+    """Return plants and weights of what a multiplier asks of a law that reads `count` signals; nothing is asked below
+    the test's lowest angle.
+    """
+    slope, slopes = spec.level(FRICTION), aimed.loop.slopes
+    assert slope is not None, "it belongs to a specification with a friction margin"
+    factor = slope * (1.0 + spec.reserve + MARGIN_RESERVE) / float(np.min(slopes[slopes > 0.0]))
+    theta = 2 * np.pi * f * spec.sample_time_s
+    tested = theta >= LOWEST_ANGLE
+    limit = limit_feedback(aimed.loop, theta[tested], aimed.multiplier, factor)
+    plants, weights = np.zeros((count, f.size), dtype=complex), np.zeros((count, count, f.size), dtype=complex)
+    plants[:, tested], weights[:, :, tested] = limit.plants, limit.weights
+    return plants, weights

@@ -45,7 +45,7 @@ from seaopt.control.tuning.law_numbers import (
     W_R,
     LawNumbers,
 )
-from seaopt.control.tuning.optimisation_problem import CURVES, LINEAR_LIMITS, NOISE, PASSIVE, Task
+from seaopt.control.tuning.optimisation_problem import CURVES, LINEAR_LIMITS, NOISE, PASSIVE, SCOPES, Task
 from seaopt.executors import solve_ipopt
 
 POINTS_PER_LIMIT = 24  # of each kind of limit
@@ -201,12 +201,14 @@ def _build_program(
     inside: bool,
     prefilter: str,
     signals: int,
+    moved: bool,
 ) -> Any:
     """Return the IPOPT solver; its data are those of `_solve`, in the same order."""
     passive, tops = PASSIVE in kinds, POINTS_PER_LIMIT * ((PASSIVE in kinds) + signals * (FRICTION in kinds))
     n = POINTS_PER_LIMIT * len(kinds)
     total = n + quadrature * WORST_PLANTS * (not noise)
-    complex_data = ("p", "q", "kept", "inverse", *(("fixed", "speed", "sense") if paths else ()))
+    complex_data = ("p", "q", "kept", "inverse")
+    complex_data += (("fixed", "speed", "sense") if paths else ()) + (("asked",) if moved else ())
     shapes = (
         {f"{name}_{part}": total for name in complex_data for part in ("re", "im")}
         | {
@@ -245,6 +247,8 @@ def _build_program(
         if paths:
             c_v = _Complex.of(series) * x[K_V] * at["sense"]
             loop = loop + (at["fixed"] - 1.0) + c_v * at["speed"]
+        if moved:
+            loop = loop + c_r * at["asked"]
         return _Points(p=at["p"], c_y=c_y, c_r=c_r, c_v=c_v, loop=loop)
 
     names = [f"{name}_{part}" for name in complex_data for part in ("re", "im")]
@@ -326,7 +330,10 @@ def _solve(
     spec, noise = task.spec, task.spec.objective == "noise"
     m, kinds, passive, friction = grid.f.size, tuple(grid.levels), task.port is not None, grid.friction.y.size > 0
     row, column = np.divmod(np.concatenate([chosen[kind] for kind in kinds]), m)
-    columns, bottoms, tops = [column], [grid.plants.at((row, column))], list[Path]()
+    columns, tops = [column], list[Path]()
+    bottoms = [grid.plants.at((row, column))]
+    if bottoms[0].r is not None:  # what is asked of the design plant is asked of the force law alone
+        bottoms[0].r[np.repeat([kind in SCOPES["design plant"] for kind in kinds], POINTS_PER_LIMIT)] = 0.0
     radii, unit = grid.discs[row, column], np.zeros(0, dtype=complex)
     levels = [grid.levels[kind][chosen[kind] % m] for kind in kinds]
     if passive:
@@ -354,6 +361,7 @@ def _solve(
         bottoms += [grid.plants.at((plant, padded)) for plant in worst]
     column = np.concatenate(columns)
     p, fixed, speed = (np.concatenate([getattr(path, part) for path in bottoms]) for part in ("y", "fixed", "v"))
+    asked = np.concatenate([0.0 * path.y if path.r is None else path.r for path in bottoms])
     at = task.find_bandwidth(grid)
     low, high = task.bounds(start)
     sizes = np.abs(start)
@@ -371,6 +379,8 @@ def _solve(
     if paths:
         sense = task.sense(grid.q)
         every += [(fixed, design.fixed), (speed, design.v), (sense[column], sense)]
+    if grid.plants.r is not None:
+        every.append((asked, 0.0 * design.y))  # the bandwidth is the force law's
     data = [
         *(part for z, _ in every for part in (np.real(z), np.imag(z))), weights, np.log(np.concatenate(levels)),
         [part for _, z in every for part in (z[at].real, z[at].imag)], [spec.sample_time_s], [task.k_ff], scale,
@@ -389,6 +399,7 @@ def _solve(
         bool(start[SPEED_RATE] > 0.0),
         "" if spec.reference_filter is None else spec.reference_filter.order,
         grid.friction_size.y.shape[1],
+        grid.plants.r is not None,
     )
     value = task.objective(grid, law)
     slack = max(0.0, np.log(task.worst(grid, law))) + 0.01
@@ -418,4 +429,4 @@ def _stack(paths: Sequence[Path]) -> list[Values]:
 
 def _integrate_sensitivity(task: Task, grid: Grid, law: LawResponse) -> Values:
     """Return the integral of abs(S) of every plant."""
-    return (1.0 / np.abs(grid.plants.add_up(law.c_y, law.c_v))) @ task.weights(grid.f)
+    return (1.0 / np.abs(grid.plants.add_up(law.c_y, law.c_v, law.c_r))) @ task.weights(grid.f)

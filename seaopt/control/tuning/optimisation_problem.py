@@ -40,10 +40,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from seaopt.control.laws.limits import BY_NAME, LIMITS, STEADY, STEADY_PERIODS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
@@ -61,17 +62,16 @@ from seaopt.control.laws.structures import (
 )
 from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.absolute_stability import (
-    LOWEST_ANGLE,
     SIMPLEST,
     FrictionMargin,
     friction_margin,
-    limit_feedback,
 )
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import MeasuredPlant
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import TransferFunction
@@ -85,9 +85,12 @@ from seaopt.control.tuning.grid import (
     PlantWithFriction,
     Response,
     Usage,
+    feed_back,
     measured_discs,
+    stack_paths,
     use_disc,
     use_friction,
+    weigh_friction,
 )
 from seaopt.control.tuning.law_numbers import (
     DAMPING,
@@ -110,6 +113,8 @@ from seaopt.control.tuning.law_numbers import (
     least_integral_rate,
     warp_frequency,
 )
+from seaopt.control.tuning.moved_links import MovedLinks, close_plant
+from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 
 OBJECTIVE_HZ = 0.1  # disturbances count from here
@@ -129,7 +134,6 @@ SCOPES: dict[Scope, tuple[str, ...]] = {
 TRACKING = tuple(name for name, curve in CURVES.items() if curve.of == "P C_r")  # limits on the reference's path
 NOISE, PASSIVE = "max_noise_gain", "passive_band_hz"
 LINEAR_LIMITS = 4
-MARGIN_RESERVE = 0.02  # of the slope asked: the test gives its margin to a hundredth, and looks between angles
 
 
 @record(eq=False)
@@ -142,7 +146,9 @@ class Task:
 
     What it reads besides the regulated one has an entry each in `further`: the filter C that feeds it back, which is
     given, or the `SpeedLoop` that is tuned. `link` is what the last of them is made of, where that feeds the motion of
-    the link forward. `eased` are factors by which more of a limit may be used while a law is looked for, by its name
+    the link forward. `models` are the plants that are sampled; None where one is measured. With `moved` links the outer
+    loop is closed around them, but for what is asked of the design plant alone, which is asked of the force law.
+    `eased` are factors by which more of a limit may be used while a law is looked for, by its name
     (`seaopt.control.tuning.solution`); and unless it `settles`, any part of a step may be left to the integral.
     """
 
@@ -157,6 +163,8 @@ class Task:
     signals: tuple[str, ...] = ()
     further: tuple[TransferFunction | SpeedLoop, ...] = ()
     link: LinkPath | None = None
+    models: tuple[tuple[Plant, CompletedParameters] | None, ...] = ()
+    moved: MovedLinks | None = None
     eased: Mapping[str, float] = field(default_factory=dict[str, float])
     settles: bool = True
 
@@ -315,6 +323,10 @@ class Task:
             observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[T_Q])),
         )
 
+    def enclosed(self, outer: OuterLoop, per_effort: float) -> Task:
+        """Return the task with an outer loop around the plants whose links move. `per_effort` is the command's."""
+        return replace(self, moved=MovedLinks.of(outer, self.models, self.signals, per_effort, self.spec))
+
     def law_of(self, x: LawNumbers) -> Law:
         """Return the law of a vector, not balanced."""
         return self._make_law(self.gains(x))
@@ -327,12 +339,20 @@ class Task:
 
     def loop(self, x: LawNumbers, plant: int = 0) -> Loop | DiscLoop:
         """Return the loop around one plant."""
-        return close_plant(self.plants[plant], self.law_of(x))
+        return self._close(plant, self.law_of(x))
+
+    def _close(self, row: int, law: Law) -> Loop | DiscLoop:
+        """Return the loop of a law around one plant, with the outer loop where its link moves."""
+        moved = None if self.moved is None else self.moved.close(row, law)
+        return close_plant(self.plants[row], law) if moved is None else moved
 
     def is_stable(self, x: LawNumbers) -> bool:
         """Tell whether every plant's loop is stable: by its eigenvalues, or by the turns of a measured one."""
-        law = self._make_law(replace(self.gains(x), prefilter=None))  # which is no part of the loop
-        return all(close_plant(plant, law).is_stable() for plant in self.plants)
+        gains = self.gains(x)
+        if self.moved is None:
+            gains = replace(gains, prefilter=None)  # which is no part of the loop
+        law = self._make_law(gains)
+        return all(self._close(row, law).is_stable() for row in range(len(self.plants)))
 
     def grid(self, f: Frequencies, rows: Sequence[int] | None = None) -> Grid:
         """Return the responses of the plants, or of some of them, at frequencies."""
@@ -345,7 +365,7 @@ class Task:
         paths = [self._respond(row, f) for row in rows]
         discs = np.array([measured_discs(self.plants[row], f) for row in rows])
         unit = np.zeros(f.size, dtype=complex)
-        count = 1 + len(self.further)
+        count, feed = 1 + len(self.further), partial(feed_back, further=self.further, f=f, ts=self.spec.sample_time_s)
         loops, forces = np.zeros((2, count, f.size), dtype=complex)
         if self.port is not None and self.spec.passive_band_hz is not None:
             low, high = self.spec.passive_band_hz
@@ -356,55 +376,31 @@ class Task:
         plants = np.zeros((len(aimed), count, f.size), dtype=complex)
         weights = np.zeros((len(aimed), count, count, f.size), dtype=complex)
         for k, sliding in enumerate(aimed):
-            plants[k], weights[k] = self._limit_feedback(sliding, f)
+            plants[k], weights[k] = weigh_friction(sliding, self.spec, count, f)
         return Grid(
             f=f,
             q=q,
-            plants=Path(**{part: np.array([getattr(path, part) for path in paths]) for part in ("fixed", "y", "v")}),
+            plants=stack_paths(paths),
             discs=discs,
             rows=rows,
             kept=kept,
             inverse=inverse,
-            port=self._feed(loops, 1.0, f),
-            force=self._feed(forces, 1.0, f),
+            port=feed(loops, 1.0),
+            force=feed(forces, 1.0),
             unit=unit,
-            friction=self._feed(plants, 1.0, f),
-            friction_size=self._feed(weights, 0.0, f),
+            friction=feed(plants, 1.0),
+            friction_size=feed(weights, 0.0),
             levels={name: self.level(name, f) for name in self.curve_names},
         )
 
-    def _feed(self, signals: Complex[np.ndarray, "... y m"], start: float, f: Frequencies) -> Path:
-        """Return a number and a weighted sum over the signals fed back, of one row per signal."""
-        y = signals[..., 0, :]
-        v = np.zeros_like(y)
-        fixed = v + start
-        for row, path in enumerate(self.further, start=1):
-            if isinstance(path, SpeedLoop):
-                v = signals[..., row, :]
-            else:
-                fixed = fixed + signals[..., row, :] * path.response(f, self.spec.sample_time_s)
-        return Path(fixed=fixed, y=y, v=v)
-
     def _respond(self, row: int, f: Frequencies) -> Path:
         """Return 1 + L of one plant, the speed of a speed loop as it is read."""
-        plant = self.plants[row]
+        plant, moved = self.plants[row], self.moved
         if not self.further or isinstance(plant, MeasuredPlant):  # whose link is held: what is read besides is zero
-            return Path(fixed=np.ones(f.size, dtype=complex), y=plant.response(f), v=np.zeros(f.size, dtype=complex))
-        return self._feed(plant.responses(f), 1.0, f)
-
-    def _limit_feedback(
-        self, aimed: PlantWithFriction, f: Frequencies
-    ) -> tuple[Complex[np.ndarray, "y m"], Complex[np.ndarray, "y y m"]]:
-        """Return plants and weights of what a multiplier asks; nothing is asked below the test's lowest angle."""
-        slope, slopes = self.spec.level(FRICTION), aimed.loop.slopes
-        assert slope is not None, "it belongs to a specification with a friction margin"
-        factor = slope * (1.0 + self.spec.reserve + MARGIN_RESERVE) / float(np.min(slopes[slopes > 0.0]))
-        theta, count = 2 * np.pi * f * self.spec.sample_time_s, 1 + len(self.further)
-        tested = theta >= LOWEST_ANGLE
-        limit = limit_feedback(aimed.loop, theta[tested], aimed.multiplier, factor)
-        plants, weights = np.zeros((count, f.size), dtype=complex), np.zeros((count, count, f.size), dtype=complex)
-        plants[:, tested], weights[:, :, tested] = limit.plants, limit.weights
-        return plants, weights
+            path = Path(fixed=np.ones(f.size, dtype=complex), y=plant.response(f), v=np.zeros(f.size, dtype=complex))
+        else:
+            path = feed_back(plant.responses(f), 1.0, self.further, f, self.spec.sample_time_s)
+        return path if moved is None else replace(path, r=moved.respond(row, f))
 
     def terms(self, grid: Grid, x: LawsNumbers) -> LawTerms:
         """Return the law's terms on a grid."""
@@ -447,14 +443,26 @@ class Task:
         return everywhere | {name: np.array(usage) for name, usage in rows.items()}
 
     def curves(self, names: Sequence[str], grid: Grid, plants: int | slice, law: LawResponse) -> dict[str, np.ndarray]:
-        """Return the usage of the imposed ones of some limits on a grid's plants, in discs around them the worst."""
-        path, discs = grid.plants.at(plants), grid.discs[plants]
-        p, rest = path.y, path.add_rest(law.c_v)
+        """Return the usage of the imposed ones of some limits on a grid's plants, in discs around them the worst. Those
+        of the design plant are asked of the force law alone.
+        """
+        path, imposed = grid.plants.at(plants), [name for name in names if name in grid.levels]
+        if path.r is None:
+            return self._use(imposed, grid, path, plants, law)
+        own = [name for name in imposed if name in SCOPES["design plant"]]
+        others = [name for name in imposed if name not in own]
+        return self._use(others, grid, path, plants, law) | self._use(own, grid, path.alone, plants, law)
+
+    def _use(
+        self, names: Sequence[str], grid: Grid, path: Path, plants: int | slice, law: LawResponse
+    ) -> dict[str, np.ndarray]:
+        """Return the usage of limits on plants with one path."""
+        discs, p, rest = grid.discs[plants], path.y, path.add_rest(law.c_v, law.c_r)
         open_loop = rest - 1.0 + p * law.c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
         measured = bool(np.any(discs))
-        for name in filter(grid.levels.__contains__, names):
+        for name in names:
             curve, level = CURVES[name], grid.levels[name]
             if measured:
                 out[name] = use_disc(curve, level, p, discs, law.c_y, law.c_r, rest)
@@ -482,7 +490,8 @@ class Task:
         """Return the usage of the passive band, where one is asked for."""
         if self.port is None:
             return {}
-        turned = grid.force.add_up(law.c_y, law.c_v) * np.conj(grid.port.add_up(law.c_y, law.c_v))
+        at = law.c_y, law.c_v, law.c_r
+        turned = grid.force.add_up(*at) * np.conj(grid.port.add_up(*at))
         cosine = np.real(grid.unit * turned) / np.maximum(np.abs(turned), 1e-300)
         return {PASSIVE: np.where(grid.unit != 0.0, (1.0 - cosine) / (1.0 - self.spec.reserve), 0.0)}
 
@@ -524,7 +533,7 @@ class Task:
         return [
             MeasuredLoop(
                 name=name,
-                figures=self._figures(i, law),
+                figures=self.measure_figures(law, i),
                 port=None if i else port,
                 filter_samples=filter_samples,
                 integral_rad_s=integral_rad_s,
@@ -533,9 +542,15 @@ class Task:
             for i, name in enumerate(self.names)
         ]
 
-    def _figures(self, row: int, law: Law) -> LoopFigures:
-        loop = close_plant(self.plants[row], law)
-        return loop.figures(self.spec.bandwidth_hz) if isinstance(loop, DiscLoop) else loop.figures()
+    def measure_figures(self, law: Law, row: int = 0) -> LoopFigures:
+        """Return the figures of a plant's loop; of the design plant those of the force law alone, with the margins of
+        the outer loop around it.
+        """
+        whole = self._close(row, law)
+        figures = whole.figures(self.spec.bandwidth_hz) if isinstance(whole, DiscLoop) else whole.figures()
+        if self.moved is None or row >= self.design_states or not self.moved.moves(row):
+            return figures
+        return replace(self, moved=None).measure_figures(law, row).with_margins(figures)
 
     def weights(self, f: Frequencies) -> Curve:
         """Return trapezoidal weights over ln f from 0.1 Hz to the bandwidth, both of which are frequencies."""
@@ -552,8 +567,8 @@ class Task:
     def miss(self, grid: Grid, law: LawResponse) -> float:
         """Return ln of abs(F/F_ref) over -3 dB at the bandwidth, which is 0."""
         at = np.array([self.find_bandwidth(grid)])
-        path = grid.plants.at((0, at))
-        return float(np.log(np.abs(np.sqrt(2.0) * path.y * law.c_r[at] / path.add_up(law.c_y[at], law.c_v[at])))[0])
+        path, c_r = grid.plants.alone.at((0, at)), law.c_r[at]
+        return float(np.log(np.abs(np.sqrt(2.0) * path.y * c_r / path.add_up(law.c_y[at], law.c_v[at], c_r)))[0])
 
     def rank(self, grid: Grid, x: LawNumbers) -> tuple[float, float]:
         """Return what to sort laws by: the worst usage if a limit is broken, then the objective. A bandwidth that is
@@ -573,16 +588,13 @@ class Task:
 
     def objective(self, grid: Grid, law: LawResponse) -> float:
         """Return the objective on a grid."""
-        distance = np.abs(grid.plants.add_up(law.c_y, law.c_v))
-        if self.spec.objective == "noise":
+        noise = self.spec.objective == "noise"
+        plants = grid.plants.alone if noise else grid.plants
+        distance = np.abs(plants.add_up(law.c_y, law.c_v, law.c_r))
+        if noise:
             return max(float(np.max(np.abs(law.c_y) / distance[: self.design_states])), NEXT_TO_NO_NOISE)
         return float(np.max((1.0 / distance) @ self.weights(grid.f)))
 
 
 def _range(fixed: float | None, low: float, high: float) -> tuple[float, float]:
     return (low, high) if fixed is None else (fixed, fixed)
-
-
-def close_plant(plant: DigitalPlant | MeasuredPlant, law: Law) -> Loop | DiscLoop:
-    """Return the loop of a law around a plant, a model or a measured one."""
-    return DiscLoop(plant=plant, law=law) if isinstance(plant, MeasuredPlant) else Loop(plant=plant, law=law)

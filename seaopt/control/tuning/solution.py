@@ -155,6 +155,18 @@ def _descend(task: Task, grid: Grid, x: LawNumbers, *, keeping: bool = False) ->
     return refine(task, grid, improve(task, grid, x)[1], _count_rounds(task), keeping=keeping)
 
 
+def follow_task(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> Solution:
+    """Return a law near one that misses limits of a task which has changed; that one where there is none that is
+    better.
+    """
+    missed = measure_missed(task, loops)
+    if missed and max(missed.values()) <= NARROW:
+        near = tighten_limits(task, x, loops)
+        if not task.list_broken(near[1]):
+            return near
+    return retry(task, x, loops, [x])
+
+
 def search(task: Task, x: LawNumbers, loops: list[MeasuredLoop], *, again: bool = True) -> Solution:
     """Return a law that keeps the limits as it is; of one that misses them a better one, if an evolution finds it.
     `again`: whether a second population is tried where the first has no law that keeps them.

@@ -229,7 +229,7 @@ class _Scan:
     @property
     def rest(self) -> complex:
         """B of the design plant at the bandwidth."""
-        return complex(self.grid.plants.at(0).add_rest(self.c_v)[self.at])
+        return complex(self.grid.plants.alone.at(0).add_rest(self.c_v, 0.0 * self.c_v)[self.at])
 
     @property
     def inverse(self) -> float:
@@ -288,7 +288,7 @@ def _scan_fixed_weight(scan: _Scan) -> tuple[Values, GainRows]:
     gains[:, K_P] = k_p
     gains = gains[np.isfinite(k_p) & (k_p >= 0.0)]
     c_y, c_r = scan.terms.series * scan.measurement(gains), scan.behind_prefilter(gains)
-    return _judge_loops(scan, c_y) + _judge_tracking(scan, c_y, c_r) + _price_missing_integral(scan, gains), gains
+    return _judge_loops(scan, c_y, c_r) + _judge_tracking(scan, c_y, c_r) + _price_missing_integral(scan, gains), gains
 
 
 def _scan_free_weight(scan: _Scan) -> tuple[Values, GainRows]:
@@ -299,7 +299,8 @@ def _scan_free_weight(scan: _Scan) -> tuple[Values, GainRows]:
     k_p, k_d, rate = (values.ravel() for values in np.meshgrid(k_p, k_d, rates, indexing="ij"))
     gains = np.column_stack([k_p, rate * (1.0 + k_p), k_d, 0.0 * k_p, 0.0 * k_p])
     c_y = scan.terms.series * scan.measurement(gains)
-    merit = _judge_loops(scan, c_y)
+    around = scan.grid.plants.r is not None  # then the reference's weights are in the loop, too
+    merit = _judge_loops(scan, c_y, scan.behind_prefilter(gains) if around else c_y)
     weights = np.repeat(_list_weights(scan.task), 2)  # for both roots
     chosen = np.repeat(_choose_loops(merit), weights.size)
     gains, c_y, merit = gains[chosen], c_y[chosen], merit[chosen]
@@ -314,7 +315,10 @@ def _scan_free_weight(scan: _Scan) -> tuple[Values, GainRows]:
         most = np.minimum(most, scan.task.most_left_to_integral(gains[:, K_P], gains[:, K_I]))
     keep = (gains[:, W_R] >= 0.0) & (gains[:, W_R] <= most)
     gains, c_y, merit = gains[keep], c_y[keep], merit[keep]
-    return merit + _judge_tracking(scan, c_y, scan.behind_prefilter(gains)), gains
+    c_r = scan.behind_prefilter(gains)
+    if around:
+        merit = _judge_loops(scan, c_y, c_r)
+    return merit + _judge_tracking(scan, c_y, c_r), gains
 
 
 def _choose_loops(merit: Values) -> Int[np.ndarray, " k"]:
@@ -361,9 +365,9 @@ def solve_bandwidth(
     return np.concatenate([(-half + root) / lead, (-half - root) / lead])
 
 
-def _judge_loops(scan: _Scan, c_y: Responses) -> Values:
+def _judge_loops(scan: _Scan, c_y: Responses, c_r: Responses) -> Values:
     """Return the logarithm of the objective, and what is worse than any where a limit on the loop is broken."""
-    value, worst, encircles = judge_loops(scan.task, scan.grid, scan.respond(c_y, c_y))
+    value, worst, encircles = judge_loops(scan.task, scan.grid, scan.respond(c_y, c_r))
     return np.log(np.maximum(value, NEXT_TO_NO_NOISE)) + _price(worst) + np.where(encircles, 50.0, 0.0)
 
 
@@ -379,14 +383,15 @@ def judge_loops(task: Task, grid: Grid, laws: LawResponse) -> tuple[Values, Valu
         usage |= task.port_usage(grid, laws) if grid.rows[row] == 0 else {}
         for curve in usage.values():
             worst = np.maximum(worst, np.max(curve, axis=-1))
-        distance = grid.plants.at(row).add_up(laws.c_y, laws.c_v)
+        distance = grid.plants.at(row).add_up(laws.c_y, laws.c_v, laws.c_r)
         turn = np.sum(np.angle(distance[:, 1:] * np.conj(distance[:, :-1])), axis=1)
         # A stable loop turns by half a circle more for every pole of the plant that grows.
         turned = np.minimum(turned, turn - np.pi * count_growing(task.plants[grid.rows[row]]))
         if task.spec.objective == "disturbance":
             value = np.maximum(value, (1.0 / np.abs(distance)) @ weights)
         elif grid.rows[row] < task.design_states:
-            value = np.maximum(value, np.max(np.abs(laws.c_y / distance), axis=1))
+            alone = grid.plants.alone.at(row).add_up(laws.c_y, laws.c_v, laws.c_r)
+            value = np.maximum(value, np.max(np.abs(laws.c_y / alone), axis=1))
     return value, worst, turned < LEAST_TURN
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -50,12 +51,16 @@ from seaopt.control.loops.sampled_plant import (
 )
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.tuning.feasibility import check_current, check_delay
+from seaopt.control.tuning.found_law import FoundLaw, Surround, find_law, meet_outer
 from seaopt.control.tuning.frequencies import count_growing
 from seaopt.control.tuning.grid import FRICTION, PlantWithFriction, Response
 from seaopt.control.tuning.law_numbers import LawNumbers
-from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Task, close_plant
-from seaopt.control.tuning.possible_bandwidths import find_largest_fall, find_possible_bandwidths
-from seaopt.control.tuning.solution import ROOM, ease_limits, feed_link, lower_fraction, retry, search, solve
+from seaopt.control.tuning.moved_links import close_plant
+from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Task
+from seaopt.control.tuning.solution import (
+    ROOM,
+    feed_link,
+)
 from seaopt.errors import ControlError, InternalError, SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
@@ -67,7 +72,6 @@ from seaopt.plants.friction import (
     find_dry_friction,
     friction_slopes,
     friction_states,
-    list_fall_parameters,
     split_friction,
     take_sliding,
 )
@@ -80,7 +84,7 @@ FRACTION_FREQUENCIES = 1500
 STILL_HZ, LASTING, FALLS = 1e-4, 0.1, 0.01
 NO_FORCE = 0.02  # of the design plant's static gain: where the force answers less, the feedback does next to nothing
 USUAL_MS = 1.7  # that the fraction of a feedforward is chosen for where no Ms is asked
-SOLUTION, BANDWIDTHS, EASING = 1.0, 2.0, 2.0  # of the time of a tune that is not possible as asked
+AROUND = 1.0  # of the time of a tune: once more with the outer loop
 
 Draws = Sequence[Mapping[str, float]]  # of values by parameter
 RobustTo = Mapping[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse]
@@ -93,6 +97,7 @@ def tune(
     robust_to: RobustTo | None = None,
     *,
     draws: Draws = (),
+    outer: Surround | None = None,
     progress: Progress = ignore,
 ) -> Controller:
     """Tune a digital force controller.
@@ -113,6 +118,10 @@ def tune(
         every response in the discs.
     draws : sequence of mappings of parameter to value, optional
         Values at which the design plant and every plant of robust_to must meet them too; see `corners` and `draw`.
+    outer : callable, optional
+        Returns the outer loop that a tuned controller is to run with, or None: the `outer` of what
+        `seaopt.control.add_impedance` returns. Ms, Mt, disk margin and stability are then those of both loops on every
+        plant whose link moves; what is asked of the design plant alone is asked of the force law.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
@@ -151,7 +160,7 @@ def tune(
             raise
 
     try:
-        return _tune(plant, params, spec, robust_to or {}, draws, hook)
+        return _tune(plant, params, spec, robust_to or {}, draws, outer, hook)
     except (SeaoptError, MemoryError):
         raise
     except Exception as error:
@@ -179,6 +188,7 @@ def _tune(
     spec: ControllerSpec,
     robust_to: RobustTo,
     draws: Draws,
+    outer: Surround | None,
     progress: Progress,
 ) -> Controller:
     model = name_design(plant)
@@ -202,25 +212,17 @@ def _tune(
     at_rest, allowed = _find_rest_gain(task), spec.level("max_noise_gain")
     if at_rest is not None and allowed is not None:  # no law keeps it, at any bandwidth: the others are looked after
         task = replace(task, eased={"max_noise_gain": ROOM * at_rest / allowed})
-    first = SOLUTION * (8.0 if task.asks_margin else 1.0)
-    solving, seeking, easing = divide(progress, first, BANDWIDTHS, EASING)
-    x, loops = solve(task, progress=solving)
-    task, x, loops = lower_fraction(task, x, loops)
-    if not task.eased:
-        x, loops = search(task, x, loops)
-    possible, broken = None, task.list_broken(loops)
-    if broken - {FRICTION}:  # of a margin alone it is known what can be had
-        near: list[LawNumbers] = []
-        if not task.eased:
-            possible, near = _find_possible(task, x, seeking, stable="stability" not in broken)
-        # From there another answer may be in reach: a better compromise, or none needed.
-        if near:
-            x, loops = retry(task, x, loops, near)
-        if task.list_broken(loops):
-            x, loops = ease_limits(task, x, loops, easing)
-    controller = make_controller(task, x, loops, (plant, params), possible)
+    alone, around = divide(progress, 1.0, AROUND * (outer is not None))
+    found = find_law(task, (), alone)
+    if outer is not None:
+        found = meet_outer(found, partial(_describe, design=(plant, params)), outer, around)
+    controller = _describe(found, (plant, params))
     progress(f"{spec.structure}, {spec.bandwidth_hz:g} Hz", 1.0)
     return controller
+
+
+def _describe(found: FoundLaw, design: tuple[Plant | MeasuredResponse, ParameterSet]) -> Controller:
+    return make_controller(found.task, found.x, found.loops, design, found.possible)
 
 
 def name_design(plant: Plant | MeasuredResponse) -> Plant:
@@ -228,27 +230,6 @@ def name_design(plant: Plant | MeasuredResponse) -> Plant:
     model = plant.plant if isinstance(plant, MeasuredResponse) else plant
     require_plant(model, "plant", ControlError)
     return model
-
-
-def _find_possible(
-    task: Task, x: LawNumbers, progress: Progress, *, stable: bool
-) -> tuple[PossibleBandwidths, list[LawNumbers]]:
-    """Return what is possible instead, and laws near it: at other bandwidths, or with friction that falls less. The
-    fall is what to ask about where no law is `stable` at this bandwidth, or none keeps the limits at any.
-    """
-    possible, near = find_possible_bandwidths(task, x, progress)
-    if (stable and possible.nearest_hz) or not any(map(count_growing, task.plants)):
-        return possible, near
-    eased = find_largest_fall(task)
-    if eased is None:
-        return possible, near
-    steepest, largest, law = eased
-    friction, fall = steepest.find_fall()
-    parameters = list_fall_parameters(steepest.model, friction)
-    possible = replace(
-        possible, fall=fall, largest_fall=largest * fall, fall_unit=friction.slope_unit, fall_parameters=parameters
-    )
-    return possible, [*near, law]
 
 
 def make_task(
@@ -328,6 +309,7 @@ def make_task(
         frictions=_find_friction(spec, signals, [pair for _, pair in pairs], plants, whole, gain, len(first)),
         further=further,
         link=link,
+        models=(*(None for _ in first), *(pair for _, pair in pairs), *(None for _ in seen)),
     )
 
 
@@ -517,7 +499,7 @@ def describe_law(
         law=law,
         command=command_of(name_design(plant), params, spec.regulated),
         spec=spec,
-        achieved=loops[0].figures,
+        achieved=loops[0].figures if task.moved is None else replace(task, moved=None).measure_figures(law),
         met=not broken,
         active_constraints=tuple(broken or list_active(spec, verdicts)),
         robust_to=task.names[task.design_states :],
@@ -527,6 +509,7 @@ def describe_law(
         possible=None if not broken else possible,
         measured=measure_all_discs(task.plants, law, spec.bandwidth_hz),
         link=task.link,
+        outer=None if task.moved is None else task.moved.outer,
         reads=() if task.signals == list_names(spec.measured) else task.signals,
     )
     if isinstance(plant, MeasuredResponse):

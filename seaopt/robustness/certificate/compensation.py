@@ -28,9 +28,9 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.control.compensation.compensate import ENOUGH, find_compensation_margins
+from seaopt.control.laws.outer_run import close, enclose
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.sampled_plant import find_rest
-from seaopt.control.running.outer_run import close, enclose
 from seaopt.errors import ControlError
 from seaopt.executors import Shared
 from seaopt.parameters import Parameter, ParameterSet

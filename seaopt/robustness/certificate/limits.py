@@ -17,7 +17,7 @@ from seaopt.control.laws.verdict import judge
 from seaopt.control.loops.measured.loop import DiscLoop, measure_discs
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY
-from seaopt.control.running.fed_back import close_whole, shows_terms
+from seaopt.control.running.fed_back import close_whole, feeds_back
 from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError
 from seaopt.estimation import Experiment, Fit
@@ -46,8 +46,8 @@ from seaopt.robustness.verification.scenarios import STEP_SHARES
 PASSIVE = "passive_band_hz"
 LOG_SENSITIVITY = "log_sensitivity"
 WITH_TERMS = (
-    "margins, worst cases and draws of every plant are of the loop with what is compensated of its weight and, around "
-    "that, the outer loop, and where it sticks with friction's compensation from the speed; what is asked of the "
+    "margins, worst cases and draws of every plant are of the loop with the outer loop around it, with what is "
+    "compensated of its weight and, where it sticks, with friction's compensation from the speed; what is asked of the "
     "design plant alone is of the law as tuned"
 )
 NO_LOG = "no log of the fit is of a plant that is certified, so that none judges the law"
@@ -77,7 +77,7 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
     of_model = survey.point and not controller.designs_on_response  # else of the response
     stated = cases.plants if survey.point else {}  # of margins nothing is required, and some take long
     amplitudes = _remark_amplitude(cases, design) if survey.point else ()
-    closed = any(map(shows_terms, cases.plants.values()))
+    closed = any(feeds_back(controller, plant) for plant in cases.plants.values())
     return Evidence(
         requirements=(
             *(design_requirements(controller, design, of_design, varied) if of_model else ()),

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seaopt.control import ScheduledController
-from seaopt.control.running.fed_back import shows_terms, split_states
+from seaopt.control.running.fed_back import feeds_back, split_states
 from seaopt.control.scheduling.scheduled_controller import place_variable
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import join_words
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from seaopt.robustness.certificate.certificate import Certificate
 
 MOTION_RATE = "min_motion_rate"
-FED_BACK = "what its terms feed back changes with it, too"
+FED_BACK = "what its terms, or its outer loop, feed back is in no bound"
 BOUND, SWEEP = 0.2, 5.0  # seconds that a stretch, and the sweeps of a plant, take as a rule
 
 
@@ -121,7 +121,7 @@ def _bound_plants(
     middle = replace(schedule.controllers[0], law=schedule.table.law(0.5 * (low + high)))
     out: list[StretchBound] = []
     for name, plant in split_states(middle, models, nominal).items():
-        if shows_terms(plant):
+        if feeds_back(middle, plant):
             out.append(StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=FED_BACK))
             continue
         values = place_variable(plant, nominal, schedule.over, 0.5 * (low + high))

@@ -15,7 +15,7 @@ from seaopt.bench import Sensors
 from seaopt.codec import from_content, join_schemas
 from seaopt.control import Controller, LoopFigures, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
-from seaopt.control.running.fed_back import close_whole, shows_terms, split_states
+from seaopt.control.running.fed_back import close_whole, feeds_back, split_states
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_schema, check_seal, plain
 from seaopt.parameters import ParameterSet
@@ -224,7 +224,7 @@ def _build_one(
     try:
         figures = {name: close_whole(controller, plant, parameters).figures() for name, plant in linear.items()}
         for name, plant in linear.items():
-            if shows_terms(plant):
+            if feeds_back(controller, plant):
                 _check_current(name, content["plants"][name], figures[name])
         worst = {name: content["plants"][name]["worst"] for name in linear}
         certificate = Certificate(

@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
+from seaopt.control.laws.outer_run import close, enclose
 from seaopt.control.loops.loop import GROWING, STABLE, Loop
-from seaopt.control.running.outer_run import close, enclose
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record

@@ -12,9 +12,9 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation
 from seaopt.control import Controller
 from seaopt.control.laws.limits import BY_NAME, STEADY, STEADY_PERIODS
+from seaopt.control.laws.outer_run import close, enclose
 from seaopt.control.laws.realisation import RunnableLaw, runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
-from seaopt.control.running.outer_run import close, enclose
 from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet

@@ -19,7 +19,7 @@ from seaopt.control import (
     compensate_schedule,
     tune_schedule,
 )
-from seaopt.control.running.fed_back import close_terms, split_states
+from seaopt.control.running.fed_back import close_terms, close_whole, split_states
 from seaopt.errors import ControlError
 from seaopt.robustness.certificate.cases import pose
 from seaopt.robustness.uncertainty.batch import batch_figures
@@ -111,6 +111,22 @@ def test_a_weight_is_fed_back_with_the_outer_loop_around_it(force, around, angle
     found = close_terms(controller, plants["knee"]).close(plants["knee"], at).figures()
     check_figures(found, close_by_hand(controller, angle, around=around))
     assert abs(found.bandwidth_hz - controller.close(KNEE, at).figures().bandwidth_hz) > 0.1
+
+
+@pytest.mark.parametrize("around", [ASKED, replace(ASKED, stiffness=0.0)])
+def test_an_outer_loop_is_closed_without_a_weight_too(force, around):
+    """At the nominal parameters and at draws; a link that is held has the force loop alone."""
+    controller = add_impedance(force, KNEE, VALUES, around)
+    plants = split_states(controller, {"knee": KNEE, "stand": HELD}, VALUES)
+    assert plants == {"knee": KNEE, "stand": HELD} and close_terms(controller, HELD) is controller
+    loop = close_by_hand(controller, around=around, share=0.0)
+    check_figures(close_whole(controller, KNEE, VALUES).figures(), loop)
+    assert close_whole(controller, KNEE, VALUES).figures().ms != pytest.approx(force.close(KNEE, VALUES).figures().ms)
+    masses = np.array([1.0, 3.0, 6.0])
+    found = batch_figures(controller, KNEE, VALUES, {"m": masses})
+    by_hand = [close_by_hand(controller, around=around, share=0.0, m=mass) for mass in masses]
+    radii = [np.max(np.abs(loop.poles())) for loop in by_hand]
+    np.testing.assert_allclose(found.spectral_radius, radii, atol=2e-8)
 
 
 def test_draws_have_the_slope_where_they_rest(force):

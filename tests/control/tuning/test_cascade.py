@@ -16,12 +16,12 @@ from seaopt.control import Controller, Impedance, add_impedance, cascade_pid, sw
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.rendering import apparent_impedance
+from seaopt.control.laws.outer_run import enclose
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.laws.structures import Gains, InnerLoop, Prefilter, SpeedLoop
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import sample
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.outer_run import enclose
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.reporting.sections.kinds.controller import list_achieved

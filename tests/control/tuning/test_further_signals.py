@@ -48,7 +48,7 @@ def test_the_curves_are_those_of_the_loop(structure: str) -> None:
         assert isinstance(plant, DigitalPlant)
         loop = Loop(plant=plant, law=law)
         path = grid.plants.at(row)
-        distance = path.add_up(response.c_y, response.c_v)
+        distance = path.add_up(response.c_y, response.c_v, response.c_r)
         np.testing.assert_allclose(distance - 1.0, loop.open_loop(grid.f), rtol=1e-8)
         np.testing.assert_allclose(path.y * response.c_r / distance, loop.tracking(grid.f), rtol=1e-8)
     if structure != "given":
@@ -66,8 +66,8 @@ def test_the_law_is_affine_in_its_gains(structure: str) -> None:
     at, before, after = linearise_law(task, grid, x), task.respond(grid, x), task.respond(grid, moved)
     for name, by in (("c_y", at.by_y), ("c_r", at.by_r), ("c_v", at.by_v)):
         np.testing.assert_allclose(getattr(after, name) - getattr(before, name), change @ by, rtol=1e-7, atol=1e-11)
-    distances = [grid.plants.add_up(law.c_y, law.c_v) for law in (before, after)]
-    moved_by = grid.plants.change(change @ at.by_y, change @ at.by_v)
+    distances = [grid.plants.add_up(law.c_y, law.c_v, law.c_r) for law in (before, after)]
+    moved_by = grid.plants.change(change @ at.by_y, change @ at.by_v, change @ at.by_r)
     np.testing.assert_allclose(distances[1] - distances[0], moved_by, rtol=1e-7, atol=1e-11)
 
 

@@ -20,9 +20,9 @@ from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.rendering import apparent_impedance, render
 from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.outer_run import enclose
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.control.running.outer_run import enclose
 from seaopt.errors import ControlError
 from seaopt.robustness.verification.playback import play
 from seaopt.robustness.verification.scenarios import Phase, Scenario

@@ -23,6 +23,7 @@ import numpy as np
 
 from seaopt.control import Controller, ControllerSpec, ScheduledController, tune, tune_schedule
 from seaopt.control.laws.delay import settle_delays
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_table, format_values, html_text
@@ -122,8 +123,8 @@ class JointTuning(Result):
             more = "" if self.certificate.fails_by_weight else "; give more rounds, or a larger reserve"
             return f"{len(self.rounds)} rounds were too few: {broken}{more}"
         if self.status == "terms":
-            more = "what is compensated, or the outer loop, takes more of a limit than a reserve of"
-            remedy = "" if self.relief else "compensate less, or ask for a softer impedance"
+            more = "what is compensated takes more of a limit than a reserve of"
+            remedy = "" if self.relief else "compensate less"
             return f"{more} {100.0 * MOST_RESERVE:g} % makes room for: {replace(broken, remedy=remedy)}"
         return f"no witness is left that the tuner has not met: {broken}"
 
@@ -223,9 +224,10 @@ def tune_certified(
     values = (others or ParameterSet()).with_parameters(*fitted.values())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
     share, asked = 1.0 - (1.0 - confidence) / rounds, spec
+    outer = None if complete is None else partial(_find_outer, complete)
 
     def tune_at(bandwidth_hz: float) -> Controller:
-        law = tune(plant, values, replace(asked, bandwidth_hz=bandwidth_hz), robust_to, draws=draws)
+        law = tune(plant, values, replace(asked, bandwidth_hz=bandwidth_hz), robust_to, draws=draws, outer=outer)
         return law if complete is None else complete(law)
 
     drawn = {"parameters": parameters, "ranges": ranges or {}, "others": others or ParameterSet()}
@@ -234,7 +236,7 @@ def tune_certified(
     strained: Controller | None = None  # the first law that what it feeds back besides takes beyond a limit at draws
     for number, part in enumerate(divide(progress, *(1.0 for _ in range(rounds))), start=1):
         tuning, certifying = divide(prefix(part, f"round {number}"), TUNING, CERTIFYING)
-        options: dict[str, Any] = {"robust_to": witnesses, "draws": draws, "progress": tuning}
+        options: dict[str, Any] = {"robust_to": witnesses, "draws": draws, "outer": outer, "progress": tuning}
         controller: Controller | ScheduledController
         if over is None:
             controller = tune(plant, values, spec, **options)
@@ -283,6 +285,12 @@ def tune_certified(
         progress(f"{status} after {format_count(number, 'round')}", 1.0)
         return JointTuning(status=status, rounds=tuple(finished), robust_to=witnesses, relief=relief, **made)
     raise AssertionError("the last round has a status")
+
+
+def _find_outer(complete: Callable[[Any], Any], law: Controller | ScheduledController) -> OuterLoop | None:
+    """Return the outer loop of what runs of a tuned law."""
+    whole = complete(law)
+    return (whole.controllers[0] if isinstance(whole, ScheduledController) else whole).outer
 
 
 def _list_over(certificate: Certificate) -> list[Look]:

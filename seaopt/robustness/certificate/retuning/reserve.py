@@ -50,14 +50,16 @@ LookAt = Callable[[ScheduledController], Looks]
 
 @record(eq=False)
 class Look:
-    """The worst case of a plant, and how much of the limits the law alone uses there, at its points if scheduled."""
+    """The worst case of a plant, and how much of the limits the law uses there without its terms, at its points if
+    scheduled.
+    """
 
     worst: Worst
     alone: float
 
     @classmethod
     def of_law(cls, law: Controller, worst: Worst) -> Look:
-        """Return a worst case of a law, and what the law alone uses there."""
+        """Return a worst case of a law, and what the law uses there without its terms."""
         return cls(worst=worst, alone=measure_worst(_strip(law), worst[0], worst[1], worst.parameters).severity)
 
     @property
@@ -124,8 +126,8 @@ def _look_at_plant(posed: Sequence[Cases], tuned: Sequence[Cases], name: str, po
 
 
 def _strip(law: Controller) -> Controller:
-    """Return a law without what it feeds back besides."""
-    return replace(law, compensation=None, outer=None)
+    """Return a law without what its terms feed back."""
+    return replace(law, compensation=None)
 
 
 def _rank(cases: Cases, name: str, values: Mapping[str, Column]) -> Column:

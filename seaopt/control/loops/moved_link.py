@@ -1,0 +1,92 @@
+r"""A force law and the outer loop around it as one linear law, and the position that it reads of a link it moves.
+
+With :math:`s` the state of the outer loop's filtered speed (`seaopt.control.loops.outer_loop`), the force law's
+reference is :math:`\sigma K_v x_0 - \sigma (K_v + D_v \rho) x - \sigma D_v s`, :math:`\rho` the filter's rate. Put into
+the force law it gives a law of the reference x_0 and of the link's position beside what it measures itself; without
+stiffness, of a force in place of x_0, to which the damping is added. Broken at the command, the loop gains
+
+.. math:: \sigma\,(K_v + D_v D(q))\, P_x\, C_r .
+
+Where nothing holds the link, and no stiffness is asked for, its position drifts, and the damping does not depend on
+where it is. There the plant has a state :math:`\dot m = \dot x - (\epsilon / T_s) m` for it, of which the filter reads
+
+.. math:: m_k - e^{-\epsilon} m_{k-1} = \int_0^{T_s} e^{-\epsilon (1 - t / T_s)}\, \dot x\, dt,
+
+the difference to a share of :math:`\epsilon / 2`; its own eigenvalue :math:`e^{-\epsilon}` is in nothing that is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from seaopt.control.loops.drift import FORGOTTEN, add_forgetful, leave_out_drift
+from seaopt.control.loops.law import Law
+from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.control.loops.transfer_function import Frequencies, Response
+from seaopt.plants import Plant
+from seaopt.plants.memo import memo
+
+MOVED = "link_moved"  # state and output, of a link that nothing holds
+
+
+def show_position(plant: Plant, outer: OuterLoop, signals: tuple[str, ...]) -> Plant:
+    """Return a plant with an output that tells how its link moves, where its position drifts and no stiffness is asked
+    for; else the plant itself. `signals` are what the force law reads.
+    """
+    if outer.stiffness or outer.position not in plant.outputs:
+        return plant
+    return _forget_position(plant, outer.position, signals, FORGOTTEN / outer.sample_time_s)
+
+
+@memo
+def _forget_position(plant: Plant, position: str, signals: tuple[str, ...], rate: float) -> Plant:
+    if position in leave_out_drift(plant, signals).outputs:
+        return plant
+
+    def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
+        return {**plant.h(t, x, u, p), MOVED: getattr(x, MOVED)}
+
+    return replace(
+        add_forgetful(plant, position, rate, MOVED), h=h, outputs={**plant.outputs, MOVED: plant.outputs[position]}
+    )
+
+
+def find_position(plant: Plant, outer: OuterLoop) -> str | None:
+    """Return the output of a plant of `show_position` that an outer loop reads; None where the link is held."""
+    return next((name for name in (MOVED, outer.position) if name in plant.outputs), None)
+
+
+def keep_share(position: str) -> float:
+    """Return the share of the last sample's position that is taken off the next, for its speed."""
+    return float(np.exp(-FORGOTTEN)) if position == MOVED else 1.0
+
+
+def enclose_law(
+    law: Law, outer: OuterLoop, place: int | None = None, *, kept: float = 1.0, of_force: bool = False
+) -> Law:
+    """Return the law of x_0, of what a force law measures and of the link's position, that both loops make. `place`:
+    which of the measured signals is the link's position; it is one more, the last, where none of them is. `kept` is of
+    `keep_share`. `of_force`: of the force law's reference in place of x_0.
+    """
+    (n, columns), column = law.b.shape, -1 if place is None else 1 + place
+    b, d = np.zeros((n + 1, columns + (place is None))), np.zeros(columns + (place is None))
+    b[:n, 1:columns], d[1:columns] = law.b[:, 1:], law.d[1:]
+    stiffness, damping, pole, rate = outer.numbers
+    drive, through = np.append(law.b[:, 0], 0.0), law.d[0]
+    b[:, column] -= (stiffness + damping * rate) * drive
+    b[n, column] += (pole - kept) * rate
+    d[column] -= (stiffness + damping * rate) * through
+    per_given = 1.0 if of_force else outer.per_given
+    b[:, 0], d[0] = per_given * drive, per_given * through
+    a = np.block([[law.a, -damping * law.b[:, :1]], [np.zeros((1, n)), np.full((1, 1), pole)]])
+    return Law(a=a, b=b, c=np.append(law.c, -damping * through), d=d, sample_time_s=law.sample_time_s)
+
+
+def respond_outer(outer: OuterLoop, f: Frequencies, kept: float = 1.0) -> Response:
+    """Return what an outer loop takes off the force law's reference, per position, at frequencies in Hz."""
+    z = np.exp(2j * np.pi * f * outer.sample_time_s)
+    return outer.direction * (outer.stiffness + outer.damping * outer.rate * (z - kept) / (z - outer.pole))
