@@ -3,10 +3,11 @@
     python benchmarks/subjects/run.py --seconds 900 --count 300 --seed 1
 
 A subject is a machine (linear or rotary, with and without friction), a structure, its parts, a bandwidth, a rate and a
-delay, one law or a schedule. Of a certified one nothing may be unstable (eigenvalues of sample-by-sample matrices),
-over its limit of Ms or Mt by more than 0.5 % (a grid of frequencies), or ringing (a step on the nonlinear plant, by
-Runge-Kutta's method), with friction stuck and sliding, at parameters drawn here within what was certified. Of the
-package only the law's matrices are used, frozen where a schedule is.
+delay, one law or a schedule of two to five points, which is tuned until it is certified. Of a certified one nothing
+may be unstable (eigenvalues of sample-by-sample matrices), over its limit of Ms or Mt by more than 0.5 % (a grid of
+frequencies), or ringing (a step on the nonlinear plant, by Runge-Kutta's method), with friction stuck and sliding, at
+parameters drawn here within what was certified. Of the package only the law's matrices are used, frozen where a
+schedule is.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ import numpy as np
 from scipy.linalg import expm
 
 import seaopt as so
-from seaopt.control import LinkFeedforward, Notch, Prefilter, command_of, tune_schedule
+from seaopt.control import LinkFeedforward, Notch, Prefilter, command_of
 from seaopt.errors import SeaoptError
+from seaopt.robustness import tune_certified
 
 OVER, GRID, STEP_PERIODS = 1.005, 4000, 12
 SPREAD = {"k_s": 0.03, "J_l": 0.08, "k": 0.03, "I_p": 0.08}  # what is drawn, as a share
@@ -114,7 +116,7 @@ def draw_subject(number, seed):
         current_limit_A=9.0, **parts,
     )  # fmt: skip
     value = machine.values[machine.over]
-    points = [0.8 * value, 1.25 * value] if rng.random() < 0.3 else None
+    points = np.linspace(0.8, 1.25, rng.integers(2, 6)) * value if rng.random() < 0.3 else None
     return machine, spec, points, rng
 
 
@@ -229,27 +231,31 @@ def judge(machine, law_at, spec, places, ranges, rng):
 def run_subject(number, seed):
     """Return what became of a subject, and its faults."""
     machine, spec, points, rng = draw_subject(number, seed)
-    kind = f"{type(machine).__name__} {spec.structure}{' schedule' if points else ''}"
-    others = {"swing": machine.swing}
+    kind = f"{type(machine).__name__} {spec.structure}{'' if points is None else ' schedule'}"
+    plants = {"stand": machine.stand, "swing": machine.swing}
+    ranges = {
+        name: (value * (1 - share), value * (1 + share))
+        for name, share in SPREAD.items()
+        if (value := machine.values.get(name)) is not None and (points is None or name != machine.over)
+    }
+    options = {"ranges": ranges, "samples": 20, "seed": number + 1}
     try:
         if points is None:
-            law = so.tune(machine.stand, machine.params, spec, robust_to=others)
+            law = so.tune(machine.stand, machine.params, spec, robust_to={"swing": machine.swing})
+            if not law.met:
+                return kind, "limits not met", []
+            certificate = so.certify(law, plants, machine.params, simulations=False, **options)
         else:
-            law = tune_schedule(machine.stand, machine.params, spec, machine.over, points, others)
-        if not law.met:
-            return kind, "limits not met", []
-        ranges = {
-            name: (value * (1 - share), value * (1 + share))
-            for name, share in SPREAD.items()
-            if (value := machine.values.get(name)) is not None and not (points and name == machine.over)
-        }
-        options = {"ranges": ranges, "samples": 20, "simulations": False, "seed": number + 1}
-        certificate = so.certify(law, {"stand": machine.stand, "swing": machine.swing}, machine.params, **options)
+            of_points = {"over": machine.over, "points": points.tolist(), "rounds": 3}
+            done = tune_certified(machine.stand, machine.params, spec, plants, **of_points, **options)
+            law, certificate = done.controller, done.certificate
+            if certificate is None:
+                return kind, "limits not met", []
     except SeaoptError as error:
         return kind, f"refused: {str(error)[:90]}", []
     if not certificate.met:
         return kind, "not certified", []
-    places = [None] if points is None else [points[0], *rng.uniform(*points, 2)]
+    places = [None] if points is None else [points[0], *rng.uniform(points[0], points[-1], 2)]
     at = (lambda _: law) if points is None else law.at
     return kind, "certified", judge(machine, at, spec, places, ranges, rng)
 
@@ -261,11 +267,14 @@ def main():
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--schedules", action="store_true", help="schedules alone")
     options = parser.parse_args()
     begin, came, kinds, bad = time.monotonic(), collections.Counter(), collections.Counter(), {}
     for number in range(options.first, options.first + options.count):
         if time.monotonic() - begin > options.seconds:
             break
+        if options.schedules and draw_subject(number, options.seed)[2] is None:
+            continue
         kind, what, faults = run_subject(number, options.seed)
         came[what] += 1
         kinds[f"{kind}: {what}"] += 1
