@@ -99,7 +99,7 @@ def tune_schedule(
         More plants on which every plant's limits are kept at the points, such as draws; between the points the law is
         not judged on them.
     near : ScheduledController, optional
-        A schedule of these points, or of neighbours among them, under other limits or on other plants: a point that it
+        A schedule of these points, or of some of them, under other limits or on other plants: a point that it
         has is started from its gains there, any other from its neighbour's, and none from a scan at an end.
     outer : callable, optional
         Returns the one outer loop that a schedule is to run with, or None; as in `seaopt.tune`.
@@ -319,18 +319,20 @@ def _tune_chain(tasks: Sequence[Task], progress: Progress) -> Chain:
 
 
 def _follow_schedule(tasks: Sequence[Task], points: Sequence[float], near: ScheduledController) -> Chain | None:
-    """Return the numbers reached at every point from those of a schedule of all, or of some neighbours; None where
-    these break a limit. What a scan has at one point alone may be of another valley than its neighbours.
+    """Return the numbers reached at every point from those of a schedule of all, or of some; None where these break a
+    limit, or there are none. What a scan has at one point alone may be of another valley than its neighbours.
     """
     known = [k for k, point in enumerate(points) if point in near.points]
     reached: dict[int, Solution] = {}
-    for k in (*known, *range(known[-1] + 1, len(tasks)), *reversed(range(known[0]))):
+    if not known:
+        return None
+    for k in (*range(known[0], len(tasks)), *reversed(range(known[0]))):
         task = tasks[k]
         if k in known:
             gains = near.controllers[near.points.index(points[k])].gains
             start = read_numbers(gains, task.k_ff, task.spec.sample_time_s)
         else:
-            start = reached[k - 1 if k > known[-1] else k + 1][0]
+            start = reached[k - 1 if k > known[0] else k + 1][0]
         x = _follow(task, start)
         reached[k] = x, task.measure(x)
         if _breaks_limits(task, reached[k][1]):

@@ -253,11 +253,13 @@ def test_witnesses_are_kept_at_the_points_and_the_fallback_has_the_least_ms(stan
 def test_a_schedule_is_followed_from_some_of_its_points(stand, thor):
     spec, points = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6), (2e-6, 2.7e-6, 3.4e-6, 4e-6)
     whole = tune_schedule(stand, thor, spec, "J", points)
-    pair = replace(whole, points=points[1:3], controllers=whole.controllers[1:3], between=())
-    again = tune_schedule(stand, thor, spec, "J", points, near=pair)
-    assert again.met and again.points == points
-    for name in ("k_p", "k_i", "k_d"):
-        assert again.table.gains[name] == pytest.approx(whole.table.gains[name], rel=0.05)
+    for kept in ([1, 2], [1, 3]):
+        laws = tuple(whole.controllers[k] for k in kept)
+        some = replace(whole, points=tuple(points[k] for k in kept), controllers=laws, between=())
+        again = tune_schedule(stand, thor, spec, "J", points, near=some)
+        assert again.met and again.points == points
+        for name in ("k_p", "k_i", "k_d"):
+            assert again.table.gains[name] == pytest.approx(whole.table.gains[name], rel=0.05)
 
 
 @pytest.mark.parametrize(("rates", "hops"), [([1.0, 3.0, 9.0], 0), ([60.0, 0.3, 60.0], 2), ([0.0, 0.0, 40.0], 1)])

@@ -7,8 +7,9 @@ and another is searched only where that leaves something worse.
 
 What is over a limit is given to the tuner as one more plant. It knows the law alone, at the points: with what terms
 feed back, or between the points, more of a limit may be used, by a factor that hardly changes as the law does. That
-factor is taken off all limits, as a reserve. Draws and searches are never those of a certificate, which says with draws
-of its own what the law is worth.
+factor is taken off all limits, as a reserve. The two points about the worst place are tuned so first, again and again,
+as that costs little; all then start from these two. Draws and searches are never those of a certificate, which says
+with draws of its own what the law is worth.
 """
 
 from __future__ import annotations
