@@ -86,6 +86,7 @@ def accept_logs(
         read = [read_loop_log(session.problem, log, units, reference) for log in logs]
         for text in (f"note: {log.source}: {note}" for log in read for note in log.notes):
             errors.wrap(text)
+        tell("replaying the law, and comparing the machine with those that were certified", 0.1)
         result = accept(
             source,
             read,

@@ -258,7 +258,7 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
             "" if row.limit is None else f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}",
             f"{format_number(row.value, 3)}{unit_after(row.unit)}",
             "" if row.name == "stability" else _show_interval(row),
-            format_number(row.predicted, 3, ""),
+            format_number(row.predicted, 3),
             format_number(row.where_hz, 3),
             "" if row.periods is None else str(row.periods),
         )
