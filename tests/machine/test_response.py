@@ -12,8 +12,8 @@ import seaopt as so
 from seaopt.machine.excitation import design_excitation
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.measured_margins import list_margins
-from seaopt.machine.response.periods import LeftOut, cut_periods, find_period
-from seaopt.machine.response.verdicts import Measured
+from seaopt.machine.response.periods import LeftOut, cut_periods, find_period, join_blocks
+from seaopt.machine.response.verdicts import Measured, judge_response
 from seaopt.machine.ticks import take_ticks
 from tests.machine.simulator import Bench, Machine, multisine
 
@@ -220,6 +220,24 @@ def test_with_dry_friction_fewer_than_six_sets_of_phases_confirm_nothing(dry):
     assert "0 of 5 limits confirmed, 0 refuted" in text
     assert "its bandwidth is 30 Hz sliding and" in text
     assert "the log does not decide stability, Ms, Mt, reference peak and bandwidth: record 6 sets of random" in text
+
+
+def test_turns_of_a_loop_that_friction_holds_are_counted_beside_the_stuck_plant(compiler, tmp_path):
+    """A slow stage of a knee hardly slides: its machine comes to rest, its loop is nowhere near the sliding one."""
+    plant = so.plants.rotary(link="locked")
+    stated = {"N": 60, "K_tau": 0.05, "eta": 0.8, "J_m": 2e-5, "b_r": 1e-4, "f_c": 0.01, "v_s": 1.0, "k_s": 250.0}
+    values = plant.complete(so.ParameterSet()).update(**stated)
+    spec = so.ControllerSpec(
+        bandwidth_hz=4.5, bandwidth_range_hz=(4.0, 60.0), measured="tau_s", max_noise_gain=45, current_limit_A=9.0
+    )
+    law = so.tune(plant, values, spec)
+    options = {"share": 0.125, "bias": 0.0, "phases": 6, "periods": 4, "limits": {"tau_s": 30.0}}
+    played = design_excitation(law, **options, seed=1).reference
+    log = Bench(compiler, tmp_path, law).log(Machine.of_knee(values), np.append(played, np.zeros(2000)), noise=0.02)
+    assert np.std(log["tau_s"][-500:]) < 0.2 * np.std(log["tau_s"])  # nearly at rest at the end: stable
+    groups = join_blocks([cut_periods(law, take_ticks(law, log))])
+    stability = next(row for row in judge_response(law, groups, 0.95).judged if row.name == "stability")
+    assert stability.outcome == "confirmed", stability
 
 
 def test_margins_of_a_loop_that_crosses_a_gain_of_one_three_times(controller):
