@@ -264,7 +264,7 @@ def test_a_schedule_is_followed_from_some_of_its_points(stand, thor):
 
 @pytest.mark.parametrize(("rates", "hops"), [([1.0, 3.0, 9.0], 0), ([60.0, 0.3, 60.0], 2), ([0.0, 0.0, 40.0], 1)])
 def test_neighbours_of_two_valleys_are_counted(rates, hops):
-    assert _count_hops([(np.array([99.0, 100.0 * rate]), []) for rate in rates]) == hops
+    assert _count_hops([(np.array([99.0, 100.0 * rate, *[1.0] * 12]), []) for rate in rates]) == hops
 
 
 def test_inner_ends_are_those_of_equal_parts():
