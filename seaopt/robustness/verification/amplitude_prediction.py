@@ -24,9 +24,10 @@ from seaopt.control.laws.limit_cycles import AMPLITUDES, describe_friction
 from seaopt.control.loops.friction_loop import FUNDAMENTAL
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import take_sliding
+from seaopt.plants.friction import list_smoothing, take_sliding
 from seaopt.records import record
 
+JUMP = 1e-6  # m/s or rad/s, over which a friction that sticks is smoothed
 SATURATION_GAINS = np.geomspace(1.0, 1e-2, 80)
 Response = Complex[np.ndarray, " f"]
 
@@ -40,6 +41,8 @@ def predict_gain(
 ) -> Complex[np.ndarray, "a f"]:
     """Return force over reference at amplitudes (N) and frequencies (Hz): fundamental, other frictions sliding."""
     values = plant.complete(params)
+    if plant.sticks:
+        values = plant.complete(values.update(**dict.fromkeys(list_smoothing(plant), JUMP)))
     loop = controller.close(take_sliding(plant, values), values)
     p, open_loop = loop.plant.response(f), loop.open_loop(f)
     c_y, c_r = loop.law.feedback_responses(f), loop.law.reference_response(f)

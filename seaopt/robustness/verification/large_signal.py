@@ -14,6 +14,7 @@ The same gains are predicted by describing functions (`amplitude_prediction`).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -139,6 +140,7 @@ def large_signal(
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
     # A gate gives its sensor up at the largest amplitudes, where there is no response then.
     loop = build_loop(controller, plant, parameters, runnable(controller, gate=False))
+    loop = replace(loop, sticks=plant.sticks)  # a smoothed curve would let the motor creep
     if frequencies_hz is None:
         wanted = np.geomspace(band / (SLOWEST_STUCK if friction else 5.0), 2 * band, SWEEP_POINTS)
     else:

@@ -37,11 +37,17 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
 def say_bandwidths(controller: Controller, bandwidth_hz: float | None) -> str:
     """Return a bandwidth; where friction makes two of it, with the one that is left while it sticks."""
     moving, stuck = format_figure(bandwidth_hz, "Hz", missing="none"), show_stuck_bandwidth(controller)
-    return f"{moving} sliding and {stuck} Hz stuck" if stuck else moving
+    if stuck:
+        return f"{moving} sliding and {stuck} Hz stuck"
+    return f"{moving} sliding" if _measure_stuck(controller) else moving
 
 
 def show_stuck_bandwidth(controller: Controller) -> str:
-    """Return the bandwidth that is left while friction sticks, in Hz; nothing without friction."""
+    """Return the bandwidth that is left while friction sticks, in Hz; nothing without friction, and of a plant that
+    stands still then: its linear stand-in is that of a speed of smoothing, which such a plant does not have.
+    """
+    if controller.design is not None and controller.design[0].sticks:
+        return ""
     return next((format_number(row.bandwidth_hz, 3, "no") for _, row in _measure_stuck(controller)), "")
 
 
@@ -127,7 +133,7 @@ def list_achieved(controller: Controller) -> list[tuple[str, str, str]]:
     a = controller.achieved
     rows, stuck = list[tuple[str, str, str]](), _measure_stuck(controller)
     for row in list_design_figures(controller.spec, controller.design_loop):
-        two = row.limit.name == "bandwidth_hz" and stuck
+        two = row.limit.name == "bandwidth_hz" and show_stuck_bandwidth(controller)
         label = f"{row.limit.label}, sliding" if two else row.limit.label
         rows.append((label, format_figure(row.value, row.unit), row.allowed_text))
         if two:
@@ -188,12 +194,13 @@ def _describe_friction(controller: Controller) -> Iterator[str]:
         limit = "" if asked is None else f" (asked {asked:g})"
         slope = f"{format_number(loop.friction_slope)} {loop.slope_unit}"
         yield f"Friction margin {slope}{limit}: {controller.friction.describe()}."
+    sliding = "These figures are of the sliding design plant, on which the bandwidth is placed;"
+    if controller.design[0].sticks:
+        sliding = f"{sliding} a reference that moves the motor less than its friction holds is not followed;"
     for state, figures in _measure_stuck(controller):
         bandwidth = format_number(figures.bandwidth_hz, missing="none")
-        yield (
-            "These figures are of the sliding design plant, on which the bandwidth is placed;"
-            f"{state}: bandwidth {bandwidth} Hz, {figures.describe_peaks()}."
-        )
+        width = f"bandwidth {bandwidth} Hz, " if show_stuck_bandwidth(controller) else ""
+        yield f"{sliding}{state}: {width}{figures.describe_peaks()}."
 
 
 def _describe_forces(controller: Controller) -> Iterator[str]:
