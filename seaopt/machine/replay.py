@@ -1,12 +1,15 @@
 """The replay: the law, fed with the logged reference and readings, makes the logged command, to its rounding.
 
-Where rounding allows more than a tenth of the command, nothing is decided.
+Where rounding allows more than a tenth of the command, nothing is decided. Readings in coarse steps may be rounded in
+the log, or be the counts that the law itself read. They are counts where the law matches without an allowance for
+them, and where another cause leaves nothing without it, which rounding would not.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,11 +18,12 @@ from seaopt.formatting import join_words
 from seaopt.machine.causes import Cause, find_causes, leave_open
 from seaopt.machine.decimated import SAME_RATE, LineMatch, count_ticks_per_row, match_lines
 from seaopt.machine.open_loop import find_unfollowed
-from seaopt.machine.stepped import Setting, Source, make_setting, play
+from seaopt.machine.stepped import Match, Setting, Source, make_setting, play
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
 SIGMAS = 4.0  # of what rounding allows
+HIDES = 0.003  # of the command's rms, above which what is taken for rounding may be a fault
 COARSEST = 0.1  # of the command's rms, that rounding may allow of a replay that decides
 
 
@@ -59,6 +63,8 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
     """
     whole = make_setting(source, ticks)
     match = play(whole)
+    if match.met:
+        whole, match = _read_counts(whole, match, others or {})
     ticks_per_row = 1 if match.met else count_ticks_per_row(whole.controller, ticks)
     lines = match_lines(whole, ticks_per_row, others or {}) if ticks_per_row > 1 else None
     if lines is not None and lines.tells:
@@ -97,6 +103,19 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
         law_rate_hz=law_rate_hz,
         causes=causes,
     )
+
+
+def _read_counts(whole: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[Setting, Match]:
+    """Return a setting that is met, and its match, with readings that are not rounded in the log if they are not."""
+    counts = replace(whole, rounded=False)
+    as_read = play(counts)
+    if as_read.met:
+        return counts, as_read
+    if as_read.energy > (HIDES * float(np.std(whole.ticks.command))) ** 2:
+        causes, _ = find_causes(counts, as_read, others)
+        if causes and causes[0].explains:
+            return counts, as_read
+    return whole, match
 
 
 def _describe_lines(setting: Setting, match: LineMatch, ticks_per_row: int) -> Replay:

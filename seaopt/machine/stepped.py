@@ -11,7 +11,8 @@ to the commands is :math:`C A^k x_0`, which is linear in it.
 **What rounding allows.** The logged command is off by up to half its step. A reading that is logged coarser than the
 law saw it, by a step :math:`q`, adds an error of variance :math:`\frac{q^2}{12} \sum_{j \le k} h_j^2` at row k, with
 the law's impulse response h: it grows with the integral. A reading at the edge of its sensor's range is rounded alike
-in all those rows: there it is :math:`\frac{q^2}{12} (\sum_j h_j)^2`. Levels of a reference of steps are no rounding.
+in all those rows: there it is :math:`\frac{q^2}{12} (\sum_j h_j)^2`. Levels of a reference of steps are no rounding,
+nor are the counts of a converter that the law itself reads: where the commands match without this, it was none.
 In a long log that hides much; within some seconds rounding adds up to no more than in a log of these, but for what the
 integrals hold at the first of them, a polynomial, which is taken out of them first.
 """
@@ -66,6 +67,7 @@ class Setting:
     controller: Controller  # the linear form, with what it was designed for
     law: RunnableLaw | RunnableSchedule | ForceMPC
     ticks: Ticks
+    rounded: bool = True  # whether the law may have seen finer readings than are logged
 
     @property
     def linear(self) -> RunnableLaw:
@@ -216,7 +218,7 @@ def play(setting: Setting) -> Match:
     """Return the commands of a setting's law on its log."""
     ticks, linear = setting.ticks, setting.linear
     head = ticks.take(slice(0, count_head(linear)))
-    allowed, allowed_within = _allow(linear, ticks)
+    allowed, allowed_within = _allow(linear, ticks, rounded=setting.rounded)
     allowed_head, floor = allowed[: len(head)], FLOOR * float(np.std(ticks.command))
     # A start that is nearly right drifts in the integrals: what the floor allows is not taken for rounding.
     exact = float(np.mean(allowed_head**2)) - (1.0 - EXACT**2) * floor**2
@@ -319,8 +321,10 @@ def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, "
     return np.linalg.lstsq(modes, left[~limited] * weight, rcond=1e-10)[0]
 
 
-def _allow(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], float]:
-    """Return one std of what rounding allows at each row, and its rms within stretches."""
+def _allow(law: RunnableLaw, ticks: Ticks, *, rounded: bool) -> tuple[Float[np.ndarray, " n"], float]:
+    """Return one std of what rounding allows at each row, of the command and of what the law saw if that is `rounded`
+    in the log, and its rms within stretches.
+    """
     from scipy.signal import fftconvolve  # deferred: 0.3 s
 
     n, integrals = len(ticks), _count_integrals(law)
@@ -332,7 +336,7 @@ def _allow(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], flo
     steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i]) for i in range(law.measured)]
     variance = np.full(n, ticks.quantum**2 / 12.0 + (FLOOR * float(np.std(ticks.command))) ** 2)
     within = float(variance[0])
-    for b, d, values in steps:
+    for b, d, values in steps if rounded else ():
         each = find_quantisation(values) ** 2 / 12.0
         if each:
             impulse = np.concatenate([[law.per_effort * d], response @ b])

@@ -83,6 +83,29 @@ def test_a_log_whose_rounding_allows_much_of_the_command_is_undecided(controller
     assert "more digits" in str(result)
 
 
+COARSE = 100.0  # N, of a converter's counts
+
+
+def test_counts_that_the_law_reads_are_not_what_a_log_is_rounded_to(controller, bench):
+    log = bench.log(replace(Machine(), force_step=COARSE), REFERENCE)
+    assert np.unique(log["F1"]).size < 30
+    (row,) = so.accept(controller, [log]).replays
+    assert row.met and row.mismatch < 1e-12 and row.allowed < 0.01 * row.rms
+
+
+def test_a_fault_that_rounding_would_hide_is_named_where_it_leaves_nothing(controller, bench):
+    """A command 1.5 % too large, within what counts would allow if the log had rounded them."""
+    log = bench.log(replace(Machine(), force_step=COARSE), REFERENCE)
+    cause = cause_of(controller, rename(log, I=1.015 * log["I"]))
+    assert (cause.kind, cause.what) == ("factor", "I") and np.isclose(cause.value, 1.015, rtol=1e-6)
+
+
+def test_readings_that_a_log_rounds_are_still_allowed_for(controller, bench):
+    log = bench.log(Machine(), REFERENCE)
+    (row,) = so.accept(controller, [rename(log, F1=COARSE * np.round(log["F1"] / COARSE))]).replays
+    assert row.allowed > 0.05 * row.rms and (row.met or row.causes[0].kind == "rounding")
+
+
 def test_a_law_that_is_stepped_at_another_rate_is_told_by_the_clock(controller, bench):
     cause = cause_of(controller, bench.log(Machine(), REFERENCE, period=2e-3))
     assert (cause.kind, cause.what) == ("rate", "clock") and np.isclose(cause.value, 500.0)
