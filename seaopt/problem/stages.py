@@ -206,9 +206,8 @@ def tune_problem(
             part: Progress,
         ) -> ScheduledController:
             bands = schedule.bandwidth_hz and [schedule.bandwidth_hz[schedule.points.index(at)] for at in points]
-            whole = len(points) == len(
-                schedule.points
-            )  # a measured response has its place, where a pilot may have no point
+            # A measured response has its place, where a pilot may have no point.
+            whole = len(points) == len(schedule.points)
             kept = {name: at for name, at in robust_to.items() if whole or not isinstance(at, MeasuredResponse)}
             options: dict[str, Any] = {"draws": draws, "witnesses": witnesses, "near": near, "outer": outer}
             options["progress"] = part

@@ -316,7 +316,9 @@ def _folded_trajectory(
     """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects, and by how much
     steps of half the length change its states, if that is wanted.
     """
-    steps, which = np.unique(point.count_steps(segment)[: len(forcing)], return_inverse=True)
+    counts = point.count_steps(segment)
+    steps, which = np.unique(counts[: max(len(forcing), 1)], return_inverse=True)
+    which = which[: len(forcing)]
     layout, scheme = layout_of(model.nx, model.ny, model.np, point), _Scheme.of(model, point, steps)
     clock, time = point.clock, segment.start_s + point.clock.period * np.arange(len(forcing))
     if model.linear:

@@ -50,9 +50,16 @@ def find_excesses(fit: Fit) -> Iterator[FitFinding]:
         if told:
             text = f"{what}, and the intervals are as wide as the values differ between the logs' amplitudes"
         else:
+            several = sum(experiment.plant.name == plant for experiment in fit.experiments) > 1
+            alone = sum(log.determined and log.plant == plant for log in fit.logs.values()) > 1
+            advice = (
+                "logs that do not determine them one by one do not tell: fix what is known"
+                if several and not alone
+                else "one amplitude does not tell: record a second log at half the amplitude and give both"
+            )
             text = (
-                f"{what}, and how far that moves the values one amplitude does not tell: record a second log at half "
-                "the amplitude and give both; or give the sensor's noise, sigma, where it is no white noise"
+                f"{what}, and how far that moves the values {advice}; or give the sensor's noise, sigma, where it is "
+                "no white noise"
             )
         yield FitFinding(severity="warning" if told else "error", kind="excess", where=where, text=text)
 

@@ -204,7 +204,7 @@ def _take_stretch(schedule: ScheduledController, over: Looks) -> ScheduledContro
     placed = [(each.worst.severity, each.worst[1]) for each in over.values() if schedule.over in each.worst[1]]
     _, worst = max(placed, key=lambda pair: pair[0], default=(0.0, None))
     value = schedule.points[0] if worst is None else worst[schedule.over].value
-    first = min(bisect_right(schedule.points, value), len(schedule.points) - 1) - 1
+    first = max(min(bisect_right(schedule.points, value), len(schedule.points) - 1), 1) - 1
     pair = slice(first, first + 2)
     return replace(schedule, points=schedule.points[pair], controllers=schedule.controllers[pair], between=())
 
