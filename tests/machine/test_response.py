@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -145,6 +146,19 @@ def test_the_period_is_found_under_a_bias_that_fades_in(bias):
     wave, rise = multisine(1000, LINES, 1, 60.0, 3), np.linspace(0.0, 1.0, 1000)
     reference = np.concatenate([rise * (bias + wave), bias + np.tile(wave, 6), rise[::-1] * (bias + wave)])
     assert find_period(reference) == 1000
+
+
+def test_two_periods_are_enough_to_find_one_and_of_many_the_shortest_is_found():
+    assert find_period(multisine(2000, LINES, 2, 60.0, 3)) == 2000
+    assert find_period(multisine(100, np.arange(1, 20), 400, 60.0, 3, bias=300.0)) == 100
+
+
+@pytest.mark.parametrize("decimals", [12, 3])
+def test_a_ramp_has_no_period(decimals):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert find_period(np.round(np.linspace(0.0, 700.0, 40_000), decimals)) is None
+        assert find_period(np.full(100, 3.0)) is None
 
 
 @pytest.mark.parametrize(

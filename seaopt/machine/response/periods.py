@@ -16,6 +16,8 @@ from seaopt.records import record
 
 SHORTEST = 20  # ticks of a period
 LIKE = 0.25  # of the autocorrelation at zero: what a period's is at least
+STEADY = 1e-9  # of the reference's range, a row: a ramp's steps differ by less
+MOST_LAGS = 50  # that are the likeliest periods, by either measure
 REPEATS = 0.2  # of the rows, that repeat after a period at least
 SAME = 1e-4  # of the reference's range: rows that are alike
 WEAKEST = 1e-2  # of the strongest line
@@ -83,16 +85,21 @@ class Blocks:
 
 def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
     """Return the period of a reference in rows; None where it does not repeat."""
-    moving = np.diff(reference)  # in which a bias that fades in is small
-    size = float(np.ptp(reference))
-    if not size:
+    if reference.size < 2 * SHORTEST:
         return None
-    n = moving.size
+    moving = np.diff(reference)  # in which a bias that fades in is small
+    moving -= np.mean(moving)
+    size, n = float(np.ptp(reference)), moving.size
     spectrum = np.abs(np.fft.rfft(moving, 2 * n)) ** 2
-    like = np.fft.irfft(spectrum)[: n // 2 + 2]
-    like *= n / (like[0] * (n - np.arange(like.size)))  # as many rows at every lag
+    total = np.fft.irfft(spectrum)[: n // 2 + 3]  # differences are one fewer: half of the rows is a lag inside
+    if total[0] <= (STEADY * size) ** 2 * n:
+        return None
+    like = total * n / (total[0] * (n - np.arange(total.size)))  # as many rows at every lag
     inner = like[1:-1]
     peaks = 1 + np.flatnonzero((inner >= like[:-2]) & (inner >= like[2:]) & (inner > LIKE))
+    peaks = peaks[peaks >= SHORTEST - 1]
+    # Of a period and its multiples the total is largest at the period, the mean is largest where all rows repeat.
+    peaks = np.concatenate([peaks[np.argsort(-each[peaks], kind="stable")[:MOST_LAGS]] for each in (like, total)])
     near = np.unique(
         np.concatenate([peaks - 1, peaks, peaks + 1])
     )  # where a stretch ends the peak is beside the period
