@@ -179,13 +179,15 @@ def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Vec
     crystals are, theirs is taken.
     """
     time, period = log.time, 1.0 / rate_hz
-    late = time - period * np.arange(time.size)
-    lost = np.zeros(time.size)
-    for row in np.flatnonzero(np.diff(time) > GAP * period) + 1:
-        after, before = late[row : row + AROUND], late[max(row - AROUND, 0) : row]
+    steps = np.diff(time)
+    late, lost = np.append(0.0, steps - period), np.zeros(time.size)  # late: by how much more than the row before
+    rows = np.flatnonzero(steps > GAP * period) + 1
+    for row in rows[np.argsort(-steps[rows - 1], kind="stable")].tolist():  # a late sample beside a gap is none
+        first = max(row - AROUND, 0)
+        around = np.cumsum(late[first : row + AROUND])
+        after, before = around[row - first :], around[: row - first]
         lost[row] = max(np.round((np.median(after) - np.median(before)) * rate_hz), 0.0)
-    jumps = np.flatnonzero((lost[1:] > 0) & (lost[:-1] > 0)) + 1
-    lost[jumps] = 0.0  # two late samples at one gap
+        late[row] -= period * lost[row]
     line = period * (np.arange(time.size) + np.cumsum(lost))
     drift, left = _measure_drift(line, time - line)
     round_rate = float(f"{sample_rate_hz(mean_period):.3g}")
