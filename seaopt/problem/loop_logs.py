@@ -9,7 +9,7 @@ from pathlib import Path
 from seaopt.errors import LogError
 from seaopt.logs import Column, Log, contents, read_log
 from seaopt.logs.formats import Field
-from seaopt.logs.quality.clock import JITTER_LIMIT, assess_clock
+from seaopt.logs.quality.clock import JITTER_LIMIT, assess_clock, split_at_gaps
 from seaopt.logs.reading.selection import ClockError
 from seaopt.problem.bench_tables import ExperimentTable
 from seaopt.problem.columns import make_column
@@ -18,6 +18,8 @@ from seaopt.signals import REFERENCE, REFERENCES
 from seaopt.units import bare_name
 
 MOST_NAMES = 20  # in a message
+LONG_STEP = 3.0  # periods of a step that no jitter makes of one, of ticks that are stamped late
+SAME_RATE = 1e-3  # relative: a rate of few digits is meant, and stamps tell by how much it is off
 
 
 def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], reference: str | None = None) -> Log:
@@ -70,13 +72,26 @@ def _read_ticks(path: Path, time: Column | None, channels: Mapping[str, Column],
         return log.restamp(rate_hz=rate_hz)
     clock = assess_clock(log.time, log.source)
     if clock.jitter_max > JITTER_LIMIT * clock.period:
-        rate_hz = float(f"{1.0 / clock.period:.3g}")
         raise LogError(
             f"{log.source}: a step of time differs by {clock.jitter_max / clock.period:.0%} from the period "
-            f"{clock.period:.4g} s ({JITTER_LIMIT:.0%} is allowed), though each row is a tick of the law; state the "
-            f"rate of the ticks in the problem file: [acceptance] rate_hz = {rate_hz:g}"
+            f"{clock.period:.4g} s ({JITTER_LIMIT:.0%} is allowed), though each row is a tick of the law; "
+            f"{_advise_rate(log)}"
         )
     return log
+
+
+def _advise_rate(log: Log) -> str:
+    """Return what to do about uneven stamps of ticks: their mean rate, where it explains them."""
+    parts = split_at_gaps(log.time, LONG_STEP * log.period) or [slice(None)]
+    stamps = max((log.time[part] for part in parts), key=len)
+    mean_hz = (stamps.size - 1) / float(stamps[-1] - stamps[0])
+    rates = [float(f"{mean_hz:.{digits}g}") for digits in range(2, 7)]
+    rate_hz = next(rate for rate in rates if abs(rate / mean_hz - 1.0) < SAME_RATE)
+    try:
+        log.restamp(rate_hz=rate_hz)
+    except LogError:
+        return f"their mean rate, {rate_hz:g} Hz, does not explain the stamps either: log the target's own time"
+    return f"state the rate of the ticks in the problem file: [acceptance] rate_hz = {rate_hz:g}"
 
 
 def _find_template(problem: Problem) -> ExperimentTable | None:

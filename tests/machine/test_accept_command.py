@@ -100,15 +100,15 @@ def test_columns_without_units_and_with_other_names_are_read(folder, accept):
     assert wrong.exit_code != 0 and "--reference COLUMN" in str(wrong.exception)
 
 
-@pytest.mark.parametrize("clock", ["jitter", "none"])
-def test_what_is_advised_of_an_uneven_clock_or_none_can_be_written_and_does(folder, clock, tmp_path):
+@pytest.mark.parametrize(("clock", "jitter_s", "gap"), [("jitter", 2e-4, 1), ("jitter", 3e-4, 60), ("none", 0.0, 0)])
+def test_what_is_advised_of_an_uneven_clock_or_none_can_be_written_and_does(folder, clock, jitter_s, gap, tmp_path):
     """Each row is a tick, whenever it was stamped; one that is lost is a gap."""
     from typer.testing import CliRunner
 
     log = so.read_log(folder / "good.csv")
-    stamps = log.time + np.random.default_rng(1).uniform(-2e-4, 2e-4, len(log))
+    stamps = log.time + np.random.default_rng(1).uniform(-jitter_s, jitter_s, len(log))
     header, *rows = (folder / "good.csv").read_text().splitlines()
-    names, kept = header.split(","), np.delete(np.arange(len(log)), 5000)
+    names, kept = header.split(","), np.delete(np.arange(len(log)), slice(5000, 5000 + gap))
     at = names.index("time [s]")
     cells = [row.split(",") for row in rows]
     if clock == "jitter":
@@ -124,7 +124,7 @@ def test_what_is_advised_of_an_uneven_clock_or_none_can_be_written_and_does(fold
 
     refused = str(accept(folder / "stand.toml").exception)
     assert "[acceptance]" in refused and "rate_hz = " in refused and "call log" not in refused
-    assert clock == "none" or "rate_hz = 1000" in refused
+    assert clock == "none" or refused.endswith("rate_hz = 1000")
     (folder / "even.toml").write_text(PROBLEM + "[acceptance]\nrate_hz = 1000\n")
     done = accept(folder / "even.toml")
     assert done.exit_code == 0, done.output
