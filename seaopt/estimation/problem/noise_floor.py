@@ -76,8 +76,11 @@ def measure_floors(problem: FitProblem, residuals: ResidualsByExperiment, z: Vec
     return {e.name: _add_shaking(e, residuals[e.name], floors[e.name], z) for e in problem.experiments}
 
 
+@np.errstate(all="ignore")
 def _add_shaking(experiment: FitExperiment, residuals: ExperimentResiduals, floor: NoiseFloor, z: Vector) -> NoiseFloor:
-    """Return a floor with what the noise of readings makes of the outputs of a plant that follows them."""
+    """Return a floor with what the noise of readings makes of the outputs of a plant that follows them;
+    the floor as it is of outputs that overflow where they are shaken, or whose readings have no finite noise.
+    """
     plant, rng = experiment.model.plant, np.random.default_rng(0)
     followed = [experiment.data.outputs.index(plant.followed[name].state) for name in plant.read_inputs]
     if not followed:
@@ -94,7 +97,8 @@ def _add_shaking(experiment: FitExperiment, residuals: ExperimentResiduals, floo
     )
     change = experiment.loss.slope(shaken.weighted) - experiment.loss.slope(residuals.weighted)
     shaking = np.sqrt(np.sum(change**2, axis=0) / np.maximum(floor.count, 1.0))
-    return replace(floor, noise=np.hypot(floor.noise, shaking))
+    finite = np.isfinite(shaking) & np.all(np.isfinite(shaken.weighted), axis=0)
+    return replace(floor, noise=np.hypot(floor.noise, np.where(finite, shaking, 0.0)))
 
 
 def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> NoiseFloor:

@@ -11,7 +11,7 @@ from scipy.signal import butter, lfilter, sosfilt
 import seaopt as so
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Huber, Squares
-from seaopt.estimation.problem.noise_floor import measure_excess, measure_floor, measure_floors
+from seaopt.estimation.problem.noise_floor import _add_shaking, measure_excess, measure_floor, measure_floors
 from seaopt.estimation.problem.residual_statistics import compute_residuals
 
 N = 20_000
@@ -131,13 +131,19 @@ def test_a_followed_reading_shakes_the_outputs_with_its_noise():
         log = so.Log.from_arrays(time=np.arange(N) * period, u=SLOW, **columns)
         bench = so.Experiment(plant=plant, log=log, initial_state="rest", offset=False, name="log")
         problem = pose_problem((bench,), params, loss=Squares())
-        (experiment,), z = problem.experiments, problem.unknowns.start
-        return experiment, measure_floors(problem, compute_residuals(problem, z), z)["log"]
+        z = problem.unknowns.start
+        return problem, measure_floors(problem, compute_residuals(problem, z), z)["log"]
 
-    experiment, found = measure()
+    problem, found = measure()
+    (experiment,), z = problem.experiments, problem.unknowns.start
     assert experiment.model.plant.read_inputs == ("s_read",)
     expected = [std, np.hypot(gain * std * np.sqrt(period / 2.0), 1e-3)]
     assert found.noise * experiment.sigma == pytest.approx(expected, rel=0.1)
     assert found.excess == pytest.approx(1.0, abs=0.1)
     lacking = 5.0 * expected[1] * np.sqrt(2.0) * np.sin(np.arange(N) * 0.01)
     assert measure(w=lacking)[1].excess[1] == pytest.approx(np.sqrt(1.0 + 25.0), rel=0.1)
+    # A shaken run that overflows makes no noise that would explain what is lacking.
+    residuals = compute_residuals(problem, z)["log"]
+    for far in (1e308, np.nan):
+        broken = _add_shaking(experiment, residuals, replace(found, noise=np.array([far, 1.0])), z)
+        assert broken.noise[1] == 1.0
