@@ -250,7 +250,7 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
 
 
 def _approach_waves(problem: FitProblem, start: Evaluation, callback: Callback | None) -> tuple[Evaluation, int]:
-    """Return a rough minimum at the given numbers of waves, and its iterations; the start where none is fitted. While
+    """Return a rough minimum at the given numbers of waves, and its iterations; the start where none is better. While
     other values are far off the number follows what they leave, to one from which nothing leads back.
     """
     places = _list_waves(problem)
@@ -258,7 +258,8 @@ def _approach_waves(problem: FitProblem, start: Evaluation, callback: Callback |
         return start, 0
     held = replace(problem, unknowns=problem.unknowns.bound(places, start.z[places], start.z[places]))
     rough = settle_roughly(held, held.evaluate(start.z), name_phase(callback, "looking for a start"))
-    return problem.evaluate(rough.solution.z), rough.solution.iterations
+    found = problem.evaluate(rough.solution.z)
+    return found if found.cost <= start.cost else start, rough.solution.iterations
 
 
 def _list_waves(problem: FitProblem, *, sizes: bool = False) -> list[int]:
