@@ -35,7 +35,7 @@ from seaopt.estimation.solver.settle import (
     settle_roughly,
     sharpen,
 )
-from seaopt.estimation.solver.step_shares import copy_shares
+from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.formatting import join_words
 from seaopt.parameters import QUANTILE
 from seaopt.plants import Plant
@@ -179,7 +179,7 @@ def _refit(minimum: Minimum, candidate: Candidate, coarse: FitProblem, most: flo
     for i, name in enumerate(names):
         if i >= problem.unknowns.shared:  # parameters start from the candidate's own
             z[i] = fitted.get(name, z[i])
-    problem = copy_shares(problem.with_each(substeps=max(e.substeps for e in coarse.experiments)), coarse)
+    problem = copy_steps(problem, coarse)
     if candidate.gains:
         z = _compare_gains(problem, z, candidate.gains)
     start = problem.evaluate(z)

@@ -33,7 +33,7 @@ from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_sticking
 from seaopt.estimation.solver.least_squares import FIRST_RADIUS, find_blocked, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
-from seaopt.estimation.solver.step_shares import copy_shares
+from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.estimation.solver.step_size import choose_first_steps, hold_bristles, refine_bristles
 from seaopt.parameters import ParameterSet
 from seaopt.progress import Progress, ignore
@@ -292,9 +292,8 @@ def _refit_alone(change: Change, pair: Refit, helps: float, base: Evaluation) ->
 def _pose(change: Change, old: FitProblem) -> FitProblem:
     """Return a change's problem, with the noise and the steps of another one of the same logs."""
     problem = pose_problem(change.experiments, change.params, loss=old.loss, band_hz=old.band_hz, holdout=old.holdout)
-    for name in ("sigma", "substeps"):
-        problem = problem.with_values(name, {e.name: getattr(e, name) for e in old.experiments})
-    return copy_shares(problem, old)
+    problem = problem.with_values("sigma", {e.name: e.sigma for e in old.experiments})
+    return copy_steps(problem, old)
 
 
 @_or_none

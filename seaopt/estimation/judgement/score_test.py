@@ -29,7 +29,7 @@ from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment
 from seaopt.estimation.result.covariance import compute_bread, compute_meat
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import find_blocked
-from seaopt.estimation.solver.step_shares import copy_shares
+from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.parameters import ParameterSet
 from seaopt.plants.published import GRAVITY
 from seaopt.records import record
@@ -64,7 +64,7 @@ def run_score_tests(
     if not names and not data:
         return {}
     trial, z = minimum.problem.rebuild(free_more(fit, names), minimum.z, data)
-    trial = copy_shares(trial, minimum.problem)
+    trial = copy_steps(trial, minimum.problem)
     trial.keep(z)
     evaluation = trial.evaluate(z)
     if not np.isfinite(evaluation.cost):

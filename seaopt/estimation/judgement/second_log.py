@@ -228,7 +228,7 @@ def _refit(
         solved = settle_roughly(problem, problem.evaluate(problem.unknowns.start))
     else:
         z = problem.unknowns.start_from(old.unknowns.by_name(fit.require_minimum("").z))
-        problem = problem.with_each(substeps=max(e.substeps for e in old.experiments))
+        problem = problem.with_each(substeps=max(e.even_substeps for e in old.experiments))
         solved = settle_roughly(problem, problem.evaluate(z))
     refit = summarise(solved, method, True, started)
     # What its own residual's colour and parts add belongs to how well it knows its values.

@@ -26,7 +26,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
 from seaopt.estimation.result.findings import SilentEffect
 from seaopt.estimation.result.fit_result import Fit
-from seaopt.estimation.solver.step_shares import copy_shares
+from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant, add_part
 from seaopt.plants.memo import memo
@@ -60,7 +60,7 @@ def find_silent(fit: Fit) -> tuple[SilentEffect, ...]:
     free = fit.parameters.with_parameters(*(replace(addition.parameter, free=True) for addition in added))
     try:
         joint, start = problem.rebuild(free, z, data)
-        joint = copy_shares(joint, problem)
+        joint = copy_steps(joint, problem)
         evaluation = joint.evaluate(start)
     except SeaoptError:  # what does not make a problem tells nothing
         return ()

@@ -81,7 +81,9 @@ class FitExperiment:
     loss: Loss  # applied to residuals in sigma
     band_hz: tuple[float, float] | None = None  # residuals are filtered to this band
     holdout: float = 0.0  # last fraction of the log that gets no weight
-    substeps: int = 1  # least number of integration steps per sample, but for shares of them; see `count_steps`
+    substeps: int = (
+        1  # least number of integration steps per sample, their peak where they are shared out; see `count_steps`
+    )
     halved: bool = False  # whether each of them is made in two
     predictor: SteadyStateFilter | None = None  # with one, the residual is the error of the prediction one sample ahead
 
@@ -125,6 +127,19 @@ class FitExperiment:
     def level_unseen(self) -> bool:
         """Whether offsets are to be estimated that the band does not show: they are then the mean residuals."""
         return self.data.offset is True and not sees_level(self.band_hz)
+
+    @property
+    def even_substeps(self) -> int:
+        """`substeps`, or where those are shared out about the number in every sample that leaves the same error."""
+        shares = [s.samples.shares[0] for s in self.segments if s.samples.shares is not None]
+        if not shares:
+            return self.substeps
+        part, order = np.concatenate(shares), self.model.order  # an error is as the part's power of order + 1
+        return int(np.ceil(self.substeps * (np.sum(part ** (order + 1)) / np.sum(part)) ** (1.0 / order)))
+
+    def count_even_steps(self, z: Vector) -> int:
+        """Return the integration steps per sample where none are shared out."""
+        return max(self.even_substeps, self.count_least_steps(z))
 
     def count_steps(self, z: Vector) -> int:
         """Return the integration steps per sample: more than asked for where fewer would be unstable."""

@@ -226,9 +226,9 @@ class Nuisance:
     """An experiment's own unknowns as estimated: delay, gain and offset per output, initial state per segment.
 
     `drift` has the coefficients of Legendre's polynomials over the log, `noise` the logarithms of the process noise
-    over each state's size (of a prediction-error fit), `substeps` how many integration steps each sample took (a linear
-    plant needs one), `plant` the name of the experiment's plant, empty in older files, `hold` what its inputs did
-    between samples.
+    over each state's size (of a prediction-error fit), `substeps` how many integration steps each sample took, or as
+    exact a number where some took more than others (a linear plant needs one), `plant` the name of the experiment's
+    plant, empty in older files, `hold` what its inputs did between samples.
     """
 
     delay_s: float

@@ -67,7 +67,7 @@ def describe_nuisance(
         std={
             key: float(np.sqrt(max(variance[slot.index], 0.0))) for key, slot in free.items() if slot.index is not None
         },
-        substeps=experiment.count_steps(z),
+        substeps=experiment.count_even_steps(z),
         plant=data.plant.name,
         hold=data.hold,
     )

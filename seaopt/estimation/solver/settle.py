@@ -12,7 +12,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
 from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.estimation.solver.least_squares import DECREMENT, STILL_MOVING, Callback, Solution, find_blocked, minimise
-from seaopt.estimation.solver.step_shares import share_many, share_steps
+from seaopt.estimation.solver.step_shares import even_steps, share_many, share_steps
 from seaopt.estimation.solver.step_size import (
     Checks,
     StepError,
@@ -217,7 +217,7 @@ def measure_flatness(problem: FitProblem) -> float:
 
 def coarsen(problem: FitProblem, z: Vector) -> tuple[FitProblem, Evaluation]:
     """Return a problem with integration steps as coarse as its residual at z allows, and its evaluation there."""
-    problem = problem.with_each(substeps=1)
+    problem = even_steps(problem).with_each(substeps=1)
     return choose_first_steps(problem, problem.evaluate(z), ROUGH_SUBSTEPS, roughly=True)
 
 
@@ -235,6 +235,7 @@ def settle_roughly(
     evaluation = start
     if not checked:
         problem, evaluation = choose_first_steps(problem, start, ROUGH_SUBSTEPS)
+        problem = even_steps(problem)
         problem = problem.with_each(substeps=min(ROUGH_SUBSTEPS, *(e.substeps for e in problem.experiments)))
     else:
         problem, evaluation = share_many(problem, evaluation)
@@ -273,11 +274,11 @@ def refine_to(solved: Solved, fine: FitProblem, ends: Callable[[Evaluation], boo
     `ends`: tells of each point whether it is all that is asked for.
     """
     problem, z = solved.problem, solved.solution.z
-    most = max(experiment.substeps for experiment in fine.experiments)
-    coarser = {e.name: max(most, e.count_steps(z)) for e in problem.experiments if e.substeps < most}
+    most = max(experiment.even_substeps for experiment in fine.experiments)
+    coarser = {e.name: max(most, e.count_even_steps(z)) for e in problem.experiments if e.even_substeps < most}
     if not coarser:
         return solved
-    problem = share_steps(problem, z, coarser)
+    problem = share_steps(even_steps(problem, coarser), z, coarser)
     problem, evaluation = _take_sigma(problem, problem.evaluate(solved.solution.z))
     if ends is not None and ends(evaluation):
         found = replace(solved.solution, z=evaluation.z, evaluation=evaluation)

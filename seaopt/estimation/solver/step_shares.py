@@ -12,7 +12,7 @@ They are chosen where a search has come to and stay as they are while it goes on
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,18 +55,40 @@ def share_many(problem: FitProblem, evaluation: Evaluation) -> tuple[FitProblem,
     return shared, shared.evaluate(evaluation.z)
 
 
-def copy_shares(problem: FitProblem, other: FitProblem) -> FitProblem:
-    """Return the problem with the shares of another one, where it has the same samples."""
-    shares = {
-        (e.name, tuple((s.samples.start_s, s.samples.n) for s in e.segments)): [s.samples.shares for s in e.segments]
-        for e in other.experiments
-    }
+def copy_steps(problem: FitProblem, other: FitProblem) -> FitProblem:
+    """Return the problem with the steps of another one's experiments: shared out as there where the samples are the
+    same, or else the same number in every sample.
+    """
+    others = {experiment.name: experiment for experiment in other.experiments}
 
     def take(experiment: FitExperiment) -> FitExperiment:
-        key = experiment.name, tuple((s.samples.start_s, s.samples.n) for s in experiment.segments)
-        return _with_shares(experiment, shares[key]) if key in shares and _may_share(experiment) else experiment
+        old = others.get(experiment.name)
+        if old is None:
+            return experiment
+        if not (_has_shares(old) and _may_share(experiment) and _list_samples(experiment) == _list_samples(old)):
+            return _with_even_steps(experiment, old.even_substeps)
+        return _with_shares(replace(experiment, substeps=old.substeps), [s.samples.shares for s in old.segments])
 
     return replace(problem, experiments=tuple(map(take, problem.experiments)))
+
+
+def even_steps(problem: FitProblem, names: Collection[str] | None = None) -> FitProblem:
+    """Return the problem with as exact steps in every sample where they are shared out; `names`: of these experiments,
+    all if left out.
+    """
+    shared = {e.name for e in problem.experiments if _has_shares(e) and (names is None or e.name in names)}
+    if not shared:
+        return problem
+    experiments = (_with_even_steps(e, e.even_substeps) if e.name in shared else e for e in problem.experiments)
+    return replace(problem, experiments=tuple(experiments))
+
+
+def _list_samples(experiment: FitExperiment) -> list[tuple[float, int]]:
+    return [(segment.samples.start_s, segment.samples.n) for segment in experiment.segments]
+
+
+def _with_even_steps(experiment: FitExperiment, steps: int) -> FitExperiment:
+    return _with_shares(replace(experiment, substeps=steps), [None] * len(experiment.segments))
 
 
 def _has_shares(experiment: FitExperiment) -> bool:
@@ -87,7 +109,7 @@ def _with_shares(experiment: FitExperiment, shares: Sequence[Float[np.ndarray, "
 
 @np.errstate(all="ignore")
 def _share(experiment: FitExperiment, z: Vector, steps: int) -> FitExperiment:
-    whole = _with_shares(replace(experiment, substeps=steps), [None] * len(experiment.segments))
+    whole = _with_even_steps(experiment, steps)
     if steps <= FEW or not _may_share(experiment):
         return whole
     before, order = experiment.count_steps(z), experiment.model.order

@@ -10,6 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import seaopt as so
+from seaopt.estimation.solver.settle import coarsen
+from seaopt.estimation.solver.step_shares import copy_steps, even_steps
 from seaopt.estimation.solver.step_size import STEP_ERROR_SIGMA, measure_step_error
 
 RATE_HZ, SECONDS = 500.0, 5.0
@@ -96,3 +98,27 @@ def test_the_minimum_is_that_of_fine_steps_everywhere(posed):
     at = uniform.evaluate(minimum.z)
     free = np.ones(minimum.z.size, dtype=bool)
     assert at.distance_squared(free) < 0.05**2  # standard deviations
+
+
+def test_steps_of_another_problem_are_even_where_they_cannot_be_shared_out(posed):
+    _, fit, experiment = posed
+    minimum = fit.require_minimum("")
+    problem = minimum.problem
+    steps = experiment.point(minimum.z).count_steps(experiment.segments[0].samples)
+    assert steps.mean() < experiment.even_substeps < experiment.substeps
+    even = even_steps(problem).experiments[0]
+    assert even.segments[0].samples.shares is None and even.substeps == experiment.even_substeps
+    own = copy_steps(even_steps(problem), problem).experiments[0]
+    assert own.substeps == experiment.substeps
+    assert own.segments[0].samples.shares is experiment.segments[0].samples.shares
+    segment = experiment.segments[0]
+    shifted = replace(segment, samples=replace(segment.samples, start_s=1.0, shares=None))
+    other = replace(problem, experiments=(replace(experiment, segments=(shifted,), substeps=1),))
+    assert copy_steps(other, problem).experiments[0].substeps == experiment.even_substeps
+    errors = [
+        measure_step_error(each, each.experiments[0], each.evaluate(minimum.z)).parameter
+        for each in (problem, even_steps(problem))
+    ]
+    assert 0.25 < errors[1] / errors[0] < 4.0
+    coarse, _ = coarsen(problem, minimum.z)
+    assert coarse.experiments[0].segments[0].samples.shares is None
