@@ -33,6 +33,7 @@ from seaopt.problem import Problem, certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.problem.stages import design_mpc, list_plants
 from seaopt.reporting.sections import judge
+from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.signals import REFERENCE
 
@@ -71,6 +72,7 @@ def accept_logs(
     session = Session(problem, folder)
     law, errors = session.law(), Terminal(stderr=True)
     source: Source = law if session.problem.mpc is None else session.plan()
+    session.warn_of_design(session.problem.certified_plants().values())
     path = folder / FILES["tune"]
     if stage is not None:
         path = folder / BRING_UP / stage / FILES["tune"]
@@ -100,23 +102,37 @@ def accept_logs(
     again = write_again(result, session)
     if again:
         errors.wrap(f"note: to fit these logs too, put the tables of {again[-1]} into the problem file")
-    return _show(result, content, [folder / FILE, folder / PAGE, *again], json=json, amount=amount)
+    return _show(result, session, content, [folder / FILE, folder / PAGE, *again], json=json, amount=amount)
+
+
+def _describe(result: Acceptance | BringUp, session: Session) -> dict[str, Any]:
+    """Return the content of a result's file; on a fit that is not met it is not met either."""
+    fit_met = session.fit_met()
+    return result.to_dict() | {"met": result.met and fit_met, "fit_met": fit_met}
 
 
 def _show(
-    result: Acceptance | BringUp, content: dict[str, Any], files: Sequence[Path], *, json: bool, amount: Amount
+    result: Acceptance | BringUp,
+    session: Session,
+    content: dict[str, Any],
+    files: Sequence[Path],
+    *,
+    json: bool,
+    amount: Amount,
 ) -> bool:
     """Print a result; return whether it is met. `files`: that were written of it."""
     if json:
         sys.stdout.write(to_json(content))
-        return result.met
+        return content["met"]
     console = Terminal()
     verdict = judge(result)
+    if verdict is not None and not session.fit_met():
+        verdict = doubt_design(verdict)
     show_verdicts(console, [] if verdict is None else [verdict], verbose=amount == "verbose")
     if amount != "quiet":
         show_sections(console, result, verbose=amount == "verbose")
         console.list_files(files)
-    return result.met
+    return content["met"]
 
 
 def _find_played(folder: Path, stage: str | None) -> Played | None:
@@ -171,11 +187,13 @@ def _find_others(folder: Path, own: Path, controller: Controller) -> dict[str, C
 def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[str, Any]:
     """Write acceptance.json and its page; return the content of the first."""
     command = spell_call()
-    content = result.to_dict() | {"problem": session.problem.source}
+    content = _describe(result, session) | {"problem": session.problem.source}
     write_json(session.folder / FILE, content)
     files = [Path(session.problem.source), *logs]
     title = f"Acceptance: {session.problem.title}"
-    write_acceptance_page(result, session.folder / PAGE, title=title, files=files, command=command)
+    write_acceptance_page(
+        result, session.folder / PAGE, title=title, files=files, command=command, fit_met=session.fit_met()
+    )
     return content
 
 
@@ -229,13 +247,14 @@ def plan_bring_up(
             return certify_problem(replace(problem, mpc=law.spec), linear_controller(law), source)
         return certify_problem(problem, law, source)
 
+    session.warn_of_design(session.problem.certified_plants().values())
     target = folder / BRING_UP
     with show_progress(errors, "planning the stages", errors.say) as tell:
 
         def keep_stage(stage: Stage) -> None:
             # What an earlier run planned is not said of these stages.
             (target / PLAN).unlink(missing_ok=True)
-            write_stage(stage, target / stage.name, tare=zeroing)
+            write_stage(stage, target / stage.name, tare=zeroing, fit_met=session.fit_met())
             tell(f"wrote {target / stage.name}")
 
         plan = bring_up(
@@ -252,16 +271,18 @@ def plan_bring_up(
             keep_stage=keep_stage,
             progress=tell,
         )
-    write_json(target / PLAN, plan.to_dict())
+    content = _describe(plan, session)
+    write_json(target / PLAN, content)
     page = write_bring_up_page(
         plan,
         target / "bringup.html",
         title=f"Bring-up: {session.problem.title}",
         files=[Path(session.problem.source)],
         command=spell_call(),
+        fit_met=session.fit_met(),
     )
     files = [target / PLAN, page, *(target / stage.name for stage in plan.stages)]
-    return _show(plan, plan.to_dict(), files, json=json, amount=amount)
+    return _show(plan, session, content, files, json=json, amount=amount)
 
 
 def _slow_down(problem: Problem, fraction: float) -> Problem:

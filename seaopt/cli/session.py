@@ -201,7 +201,7 @@ class Session:
         """Return the parameter values to design with, the file's for what the fit does not have."""
         return self.problem.values(self.parameters())
 
-    def _warn_of_design(self, plants: Iterable[Plant]) -> None:
+    def warn_of_design(self, plants: Iterable[Plant]) -> None:
         """Name on stderr why an earlier fit is not met, the parameters of plants that the fit cannot tell, and a delay
         that is too short.
         """
@@ -377,12 +377,12 @@ class Session:
         experiment, options = self.problem.experiment_like(log, like), self.problem.fit_options
         score = fitted.predict(experiment)
         comparison = compare_with_log(fitted, experiment, options["loss"], options["band_hz"])
+        if not fitted.met:
+            self.say(f"warning: scored {UNMET}: {fitted.verdict}")
         if as_json:
             content = {"schema": "seaopt/validation/1", "log": str(log)}
             sys.stdout.write(to_json(content | comparison.to_dict() | {"outputs": score.to_dict()}))
             return comparison.met is True
-        if not fitted.met:
-            self.say(f"warning: scored {UNMET}: {fitted.verdict}")
         console = Terminal()
         percents = ", ".join(f"{name} {percent:.2f} %" for name, percent in score.fit_percent.items())
         console.wrap(f"{log}: {percents}")
@@ -411,7 +411,7 @@ class Session:
     def _tune(self, tell: Progress) -> None:
         source = self.parameters()
         design = self.problem.design_plant
-        self._warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
+        self.warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
         result = tune_problem(self.problem, source, tell, self.executor)
         if isinstance(result, JointTuning):
             self.results["joint"], result = result, result.controller
@@ -426,7 +426,7 @@ class Session:
         if self.problem.schedule is not None:
             raise ProblemError(f"{file}: a sweep is of one law; take [controller.schedule] out")
         design = self.problem.design_plant
-        self._warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
+        self.warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
         design, robust_to = list_plants(self.problem, source)
         if self.free_law and self.problem.designs_on_response:
             raise ProblemError(
@@ -451,7 +451,7 @@ class Session:
     def _certify(self, tell: Progress) -> None:
         plants = self.problem.certified_plants()
         law = self.law()
-        self._warn_of_design(plants.values())
+        self.warn_of_design(plants.values())
         result = certify_problem(self.problem, law, self.parameters(), tell, self.executor)
         self._say_once("note", self.problem.remarks(self.values()))
         self.results["certify"] = result

@@ -80,8 +80,12 @@ def write_bring_up(plan: BringUp, folder: Path | str, *, tare: Tare | None = Non
     return tuple(files)
 
 
-def write_stage(stage: Stage, folder: Path | str, *, tare: Tare | None = None) -> list[Path]:
-    """Write the files of one stage into its own folder, as `write_bring_up` does; return them."""
+def write_stage(
+    stage: Stage, folder: Path | str, *, tare: Tare | None = None, fit_met: bool | None = None
+) -> list[Path]:
+    """Write the files of one stage into its own folder, as `write_bring_up` does; return them. `fit_met`: whether the
+    fit that its law was tuned with is met, which controller.json and the C state.
+    """
     folder = Path(folder)
     excitation, unit = stage.excitation, stage.controller.command.reference_unit
     reference = excitation.reference
@@ -93,8 +97,8 @@ def write_stage(stage: Stage, folder: Path | str, *, tare: Tare | None = None) -
     header = HEADER.format(**words, bytes=4 * period * phases, rate=f"{1.0 / excitation.sample_time_s:.10g}")
     source = SOURCE.format(**words, waves=waves)
     return [
-        *_export(stage, folder, tare),
-        write_json(folder / "controller.json", _describe(stage)),
+        *_export(stage, folder, tare, fit_met),
+        write_json(folder / "controller.json", _describe(stage) | ({} if fit_met is None else {"fit_met": fit_met})),
         write_log(log, folder / "reference.csv"),
         write_text(folder / "reference.h", header),
         write_text(folder / "reference.c", source),
@@ -103,11 +107,12 @@ def write_stage(stage: Stage, folder: Path | str, *, tare: Tare | None = None) -
     ]
 
 
-def _export(stage: Stage, folder: Path, tare: Tare | None) -> list[Path]:
+def _export(stage: Stage, folder: Path, tare: Tare | None, fit_met: bool | None) -> list[Path]:
     source = stage.source
     if isinstance(source, ForceMPC):
         return [export_mpc(source, folder)]
-    return [*export(source, folder, allow_infeasible=True, log_rows=LOG_ROWS, tare=tare, stop=stage.stop)]
+    options: dict[str, Any] = {"log_rows": LOG_ROWS, "tare": tare, "stop": stage.stop}
+    return [*export(source, folder, allow_infeasible=True, fit_met=fit_met, **options)]
 
 
 def _describe(stage: Stage) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
 from seaopt.reporting.sections.kinds.controller import say_bandwidths, show_stuck_bandwidth
+from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.units import unit_after
 
 PARTS = {"stages": "Stages", "provenance": "Provenance"}
@@ -181,7 +182,13 @@ def _say_width(band: Band) -> str:
 
 
 def write_bring_up_page(
-    result: BringUp, path: Path | str, *, title: str = "Bring-up", files: Sequence[Path | str] = (), command: str = ""
+    result: BringUp,
+    path: Path | str,
+    *,
+    title: str = "Bring-up",
+    files: Sequence[Path | str] = (),
+    command: str = "",
+    fit_met: bool = True,
 ) -> Path:
     """Write an HTML page of a bring-up, to be printed; it needs no network and no other file.
 
@@ -197,6 +204,8 @@ def write_bring_up_page(
         What it was made of: the problem file.
     command : str
         What was typed to make it, to be stated.
+    fit_met : bool
+        Whether the fit that the law was tuned with is met; the verdict states one that is not.
 
     Raises
     ------
@@ -207,11 +216,12 @@ def write_bring_up_page(
         {"heading": stage.name, "text": "", "charts": [make_chart(panel) for panel in _list_panels(stage)]}
         for stage in result.stages
     ]
+    verdict = judge(result, Commands())
     return write_result_page(
         path,
         title=title,
         parts=PARTS,
-        verdict=judge(result, Commands()),
+        verdict=verdict if fit_met or verdict is None else doubt_design(verdict),
         glance=summarise(result),
         sections=[*describe(result), describe_provenance((), files, command)],
         plates={"stages": plates},

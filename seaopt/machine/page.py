@@ -31,6 +31,7 @@ from seaopt.reporting.sections.data import (
     mark_met,
 )
 from seaopt.reporting.sections.kinds.controller import say_bandwidths, show_stuck_bandwidth
+from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.units import unit_after
 
 PARTS = {
@@ -408,6 +409,7 @@ def write_acceptance_page(
     title: str = "Acceptance",
     files: Sequence[Path | str] = (),
     command: str = "",
+    fit_met: bool = True,
 ) -> Path:
     """Write an HTML page of an acceptance; it needs no network and no other file.
 
@@ -423,17 +425,20 @@ def write_acceptance_page(
         What it was made of: the problem file and the logs.
     command : str
         What was typed to make it, to be stated.
+    fit_met : bool
+        Whether the fit that the law was tuned with is met; the verdict states one that is not.
 
     Raises
     ------
     FileError
         The folder cannot be written.
     """
+    verdict = judge(result, Commands())
     return write_result_page(
         path,
         title=title,
         parts=PARTS,
-        verdict=judge(result, Commands()),
+        verdict=verdict if fit_met or verdict is None else doubt_design(verdict),
         glance=summarise(result),
         sections=[*describe(result), describe_provenance((), files, command)],
         plates={
