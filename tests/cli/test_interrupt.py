@@ -9,9 +9,14 @@ import subprocess
 import sys
 
 import pytest
+from typer.testing import CliRunner
 
+import seaopt as so
 from seaopt.cli import main
+from seaopt.cli.main import app
 from seaopt.cli.session import Session
+from tests.machine.simulator import Bench, Machine, multisine
+from tests.machine.test_response import LINES
 
 
 def test_the_package_runs_as_the_command():
@@ -102,3 +107,43 @@ def test_a_fit_that_is_killed_as_it_is_judged_is_there_and_nobody_takes_it_for_m
     whole = Session(problem, out)
     whole.run("fit")
     assert whole.met(["fit"]) and whole.results["fit"].parameters["J"].value == inertia["value"]
+
+
+def test_bringup_and_accept_say_that_a_fit_is_not_met(tmp_path, monkeypatch, compiler):
+    """Both took it as met: they exited 0, and no file of theirs had a word of it."""
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    def run(command, *arguments):
+        return CliRunner().invoke(app, [command, str(problem), *arguments, "-o", str(out)])
+
+    def read(name):
+        return json.loads((out / name).read_text(encoding="utf-8"))
+
+    problem, out = tmp_path / "problem.toml", tmp_path / "out"
+    problem.write_text(
+        BENCH + "max_sensitivity = 1.6\ncurrent_limit_A = 9.0\n[robustness]\nsamples = 5\n", encoding="utf-8"
+    )
+    session = Session(problem, out)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.modules["seaopt.estimation.fit"], "judge", stop)
+        with pytest.raises(KeyboardInterrupt):
+            session.run("fit")
+    session = Session(problem, out)
+    session.run("tune")
+    log = Bench(compiler, tmp_path, session.law()).log(Machine(), multisine(1000, LINES, 8, 60.0, 3, bias=300.0))
+    arguments = {"bringup": [], "accept": [str(so.write_log(log, tmp_path / "log.csv"))]}
+    for command, name in (("bringup", "bringup/bringup.json"), ("accept", "acceptance.json")):
+        done = run(command, *arguments[command])
+        said = " ".join(done.output.split())
+        assert done.exit_code == 1 and "on a fit that is not met" in said and "it is not judged" in said, said
+        content = read(name)
+        assert content["met"] is False and content["fit_met"] is False
+        assert "on a fit that is not met" in (out / name).with_suffix(".html").read_text(encoding="utf-8")
+    assert read("bringup/full/controller.json")["fit_met"] is False
+    assert "NOT MET: the fit" in (out / "bringup" / "full" / "force_law.h").read_text(encoding="utf-8")
+    Session(problem, out).run("fit")
+    Session(problem, out).run("tune")
+    done = run("accept", *arguments["accept"])
+    assert done.exit_code == 0 and read("acceptance.json")["fit_met"] is True, done.output
