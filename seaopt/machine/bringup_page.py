@@ -11,6 +11,8 @@ import numpy as np
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup import Band, BringUp, Stage
+from seaopt.machine.response.verdicts import has_dry_friction
+from seaopt.plants.friction import find_dry_friction
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
@@ -33,6 +35,11 @@ BEGIN = (
 TWO_BANDWIDTHS = (
     "Dry friction makes two bandwidths, of the full law {}: the first where the motor slides, the second in motions so "
     "small that it sticks; what is played lies between."
+)
+SLIDES = (
+    "The bands are of the machine as it slides. It has {} of dry friction at the spring: motions whose force is not "
+    "many times that lie outside the bands, also on a right machine. seaopt accept judges such logs at the amplitude "
+    "that was played."
 )
 NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
 
@@ -90,6 +97,15 @@ def _explain_bandwidths(controller: Controller) -> tuple[str, ...]:
     return (TWO_BANDWIDTHS.format(say_bandwidths(controller, controller.spec.bandwidth_hz)),) if stuck else ()
 
 
+def _explain_friction(controller: Controller) -> tuple[str, ...]:
+    """Return of what the bands are where the plant has dry friction, which they leave out."""
+    if not has_dry_friction(controller) or controller.design is None:
+        return ()
+    plant, values = controller.design
+    friction = sum(find_dry_friction(plant, plant.complete(values)).values())
+    return (SLIDES.format(f"{format_number(friction, 3)}{unit_after(controller.command.effort_unit)}"),)
+
+
 def _list_row(stage: Stage) -> tuple[Any, ...]:
     controller, excitation = stage.controller, stage.excitation
     unit, limit = unit_after(controller.command.reference_unit), controller.command_limit
@@ -128,6 +144,7 @@ def _describe_stage(stage: Stage) -> Section:
         f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)}{ring}.",
         f"Expect: a step of the reference{_say_size(stage)} peaks at {' to '.join(dict.fromkeys(top))} of its size "
         f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
+        *_explain_friction(controller),
     ]
     rows = tuple(
         (
@@ -149,7 +166,15 @@ def _say_size(stage: Stage) -> str:
 
 
 def _list_panels(stage: Stage) -> Iterator[Panel]:
-    unit = stage.controller.spec.regulated
+    unit, friction = stage.controller.spec.regulated, _explain_friction(stage.controller)
+    step, tracking = _say_width(stage.step), _say_width(stage.tracking)
+    if friction:
+        captions = [f"The band is that of the certificate's draws, {each}. {friction[0]}" for each in (step, tracking)]
+    else:
+        captions = [
+            f"The step must lie in the band, which is that of the certificate's draws, {step}.",
+            f"The measured response must lie in the band, {tracking}.",
+        ]
 
     def draw_step(axis: Any) -> None:
         _draw_band(axis, stage.step, lambda values: np.asarray(values))
@@ -160,11 +185,11 @@ def _list_panels(stage: Stage) -> Iterator[Panel]:
     yield Panel(
         name=f"step_{stage.name}", title=f"{stage.name}: step", draw=draw_step, x="time [s]",
         y=(f"{unit} over the step [-]",), tight=True,
-        caption=f"The step must lie in the band, which is that of the certificate's draws, {_say_width(stage.step)}.",
+        caption=captions[0],
     )  # fmt: skip
     yield frequency_panel(
         name=f"tracking_{stage.name}", title=f"{stage.name}: tracking", draw=draw_tracking, y=("|Y/R| [dB]",),
-        tight=True, caption=f"The measured response must lie in the band, {_say_width(stage.tracking)}.",
+        tight=True, caption=captions[1],
     )  # fmt: skip
 
 
