@@ -38,6 +38,7 @@ from seaopt.control.deploy.target import (
     describe_log,
     describe_stops,
     describe_tare,
+    describe_unwatched,
     hash_law,
 )
 from seaopt.control.laws.command import name_gain_units
@@ -203,6 +204,11 @@ def export(
         templates |= LOG_TEMPLATES
         if stop is not None:
             context |= {"stops": describe_stops(stop, stored.signals, units, name_unit(stored.command))}
+            context |= {
+                "unwatched": describe_unwatched(
+                    stop, stored.signals, units | {stored.command.input: stored.command.unit}
+                )
+            }
             templates |= STAGE_TEMPLATES
     if tare is not None:
         require_type(tare, Tare, "tare", "give a Tare", ControlError)

@@ -146,6 +146,15 @@ def describe_stops(
     ]
 
 
+def describe_unwatched(stop: Mapping[str, float], signals: Sequence[str], units: Mapping[str, str]) -> list[str]:
+    """Return the signals that have a figure to stop beyond and that a stage does not watch, each with that figure."""
+    return [
+        strip_markup(f"{name}: stop it yourself beyond {float(value):.4g} {units.get(name, '')}".rstrip())
+        for name, value in stop.items()
+        if name not in signals
+    ]
+
+
 def describe_tare(tare: Tare, sample_time_s: float) -> dict[str, Any]:
     """Return the numbers of a tare as text. Raises ControlError: it is too short or too long."""
     count = 2 * round(0.5 * tare.duration_s / sample_time_s)

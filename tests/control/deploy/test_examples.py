@@ -128,6 +128,8 @@ def test_a_stage_of_bring_up_is_a_program_that_starts_without_a_kick_plays_logs_
     law = so.tune(STAND, THOR, SPEC)
     plan = so.bring_up(law, {"stand": STAND}, THOR, samples=20, fractions=(), limits={"F1": 900.0})
     so.machine.write_bring_up(plan, tmp_path)
+    header = (tmp_path / "full" / "force_law_stage.h").read_text()
+    assert f" *   I: stop it yourself beyond {plan.stages[0].stop['I']:.4g} A\n" in header and " *   F1" not in header
     p = {name: parameter.value for name, parameter in THOR.items()}
     r = p["l"] / (2.0 * np.pi * p["N_p"])
     m, b = p["m_l"] + p["J"] / r**2, p["b_r"] / r**2
