@@ -265,6 +265,7 @@ def plan_bring_up(
             share=share,
             bias=bias,
             limits=_parse_limits(limits),
+            sensors=session.problem.sensors,
             certificate=session.certificate(),
             tune_stage=tune_stage,
             certify_stage=certify_stage,

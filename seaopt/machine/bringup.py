@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.bench import Sensors
 from seaopt.codec import to_content
 from seaopt.control import Controller, ControllerSpec, ForceMPC, MPCSpec, ScheduledController, force_mpc
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
@@ -24,6 +25,7 @@ from seaopt.progress import Progress, ignore
 from seaopt.records import Result, Worded, record
 from seaopt.robustness import Certificate, certify, tune_certified
 from seaopt.robustness.uncertainty.worst import place_values
+from seaopt.robustness.verification.verification import list_readings
 from seaopt.signals import REFERENCE
 
 BRINGUP_SCHEMA = "seaopt/bringup/1"
@@ -32,6 +34,7 @@ UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
 DRAWS, SEED = 60, 1
 STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
 STOP = 1.3  # times what is predicted: where to stop
+NOISE_RUNS = 4  # with other noise each, whose largest peaks count
 OF_A_STAGE = (  # options of predictive control that a stage may have otherwise
     "bandwidth_hz", "min_sensitivity_bandwidth_hz", "current_limit_A", "command_limit", "largest_force_N",
 )  # fmt: skip
@@ -158,6 +161,7 @@ def bring_up(
     share: float = 0.5,
     bias: float = 0.0,
     limits: Mapping[str, float] | None = None,
+    sensors: Sensors | None = None,
     certificate: Certificate | None = None,
     tune_stage: Callable[[float], Source] | None = None,
     certify_stage: Callable[[Any], Certificate] | None = None,
@@ -188,6 +192,8 @@ def bring_up(
         The reference's mean, in its unit.
     limits : mapping of str to float, optional
         Largest magnitudes of outputs of the design plant: force and travel.
+    sensors : Sensors, optional
+        Noise and rounding of what the law reads, which the peaks that are expected then contain.
     certificate : Certificate, optional
         Of the full law, where there is one.
     tune_stage, certify_stage : callable, optional
@@ -245,6 +251,7 @@ def bring_up(
 
     certifying, tuning = certify_stage or certify_one, tune_stage or tune_one
     options: dict[str, Any] = {"share": share, "bias": bias, "limits": dict(limits or {}), "seed": seed}
+    options["sensors"] = sensors
     over = controller.over if isinstance(controller, ScheduledController) else None
     inside = {name: ends for name, ends in (ranges or {}).items() if name != over}
     drawn = list_draws(stand(controller, None), uncertainty, inside, DRAWS, seed)
@@ -348,11 +355,13 @@ def _make_stage(
     draws: Sequence[Mapping[str, float]],
     options: Mapping[str, Any],
 ) -> Stage:
-    place, options = options["place"], {key: value for key, value in options.items() if key != "place"}
+    place, sensors = options["place"], options["sensors"]
+    options = {key: value for key, value in options.items() if key not in ("place", "sensors")}
     controller = stand(source, place)
     dry = has_dry_friction(controller)
     phases, periods = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
     excitation = design_excitation(controller, phases=phases, periods=periods, **options)
+    excitation = replace(excitation, peaks=_add_noise(controller, excitation, sensors))
     excitation = replace(excitation, peaks=_add_terms(controller, excitation))
     assert controller.design is not None
     plant, values = controller.design
@@ -390,6 +399,32 @@ def _add_terms(controller: Controller, excitation: Excitation) -> dict[str, floa
     run = run_design(controller, [controller.design[1]], excitation.reference)
     signals = {**run.outputs, controller.command.input: run.current}
     return {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+
+
+def _add_noise(controller: Controller, excitation: Excitation, sensors: Sensors | None) -> dict[str, float]:
+    """Return the peaks of a reference where the readings have their noise and rounding: of the command, the plant and
+    what is read, those of `NOISE_RUNS` runs where they are larger. A reading's noise is drawn anew for its own peak,
+    which does not change how likely it is: white noise reaches the plant a sample later at the earliest.
+    """
+    peaks = dict(excitation.peaks)
+    if sensors is None or controller.design is None:
+        return peaks
+    plant, values = controller.design
+    noise = Sensors(noise_std=sensors.noise_std, quantisation=sensors.quantisation)
+    noise = noise.of(list_readings(controller, {"": plant}))
+    if not any((*noise.noise_std.values(), *noise.quantisation.values())):
+        return peaks
+    seen, alone = controller.see(plant), replace(controller, outer=None)  # a stage is of the force law alone
+    completed = seen.complete(controller.delay(values))
+    errors = {name: noise.combine_errors(seen, completed, name) for name in controller.signals if name in peaks}
+    for seed in range(NOISE_RUNS):
+        run = run_design(alone, [values], excitation.reference, sensors=noise, seed=seed)
+        signals = {**run.outputs, controller.command.input: run.current}
+        rng = np.random.default_rng((SEED, seed))
+        for name, (std, step) in errors.items():
+            signals[name] = np.abs(signals[name] + std * rng.normal(size=signals[name].shape)) + 0.5 * step
+        peaks = {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+    return peaks
 
 
 def _band(at: Float[np.ndarray, " m"], rows: Any) -> Band:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.bench import Sensors
 from seaopt.control import Controller, SampledLoop, run_loop, runnable
 from seaopt.control.loops.sampled_plant import find_delay, read_conditions
 from seaopt.control.running.closed_loop import LoopRun
@@ -15,8 +16,17 @@ from seaopt.parameters import ParameterSet
 RTOL = 1e-4  # of the integration: a hundredth of what a disc tells
 
 
-def run_design(controller: Controller, sets: Sequence[ParameterSet], reference: Float[np.ndarray, " n"]) -> LoopRun:
-    """Return the runs of a law, with its terms and without its guards, on its design plant with each of some values."""
+def run_design(
+    controller: Controller,
+    sets: Sequence[ParameterSet],
+    reference: Float[np.ndarray, " n"],
+    *,
+    sensors: Sensors | None = None,
+    seed: int = 0,
+) -> LoopRun:
+    """Return the runs of a law, with its terms and without its guards, on its design plant with each of some values.
+    `sensors`: the errors of what it reads, with noise of `seed`; without them it reads the true outputs.
+    """
     assert controller.design is not None
     seen, values = controller.see(controller.design[0]), [controller.delay(each) for each in sets]
     longest = max(float(find_delay(seen, read_conditions(seen, seen.complete(each)))) for each in values)
@@ -26,5 +36,6 @@ def run_design(controller: Controller, sets: Sequence[ParameterSet], reference: 
         measured=controller.signals,
         delay_samples=controller.compute_delay_samples,
         longest_delay_s=longest,
+        sensors=sensors or Sensors(),
     )
-    return run_loop(loop, values, reference, rtol=RTOL)
+    return run_loop(loop, values, reference, rtol=RTOL, seed=seed)

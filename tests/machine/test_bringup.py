@@ -162,3 +162,35 @@ def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_wh
     loop = SampledLoop(plant=stand, law=so.control.runnable(law), measured="F1", delay_samples=1)
     run = run_loop(loop, [stand.complete(values)], rows, rtol=1e-4)
     assert np.max(np.abs(run.current)) <= 1.001 * excitation.peaks["I"] < 0.8 * 9.0
+
+
+def test_expected_peaks_contain_the_noise_of_what_is_read(controller, compiler, tmp_path):
+    """Against the simulator in C, whose noise is its own: without it the figures to stop at are too low."""
+    stand, values = {"stand": so.plants.high_impedance()}, so.plants.thor()
+    judged = so.certify(controller, stand, values, samples=5)
+    options = {"fractions": (), "share": 0.02, "limits": {"F1": 900.0}, "certificate": judged}
+    (still,) = so.bring_up(controller, stand, values, **options).stages
+    (noisy,) = so.bring_up(controller, stand, values, sensors=so.Sensors(noise_std={"F1": 2.0}), **options).stages
+    assert np.array_equal(still.excitation.reference, noisy.excitation.reference)
+    bench = Bench(compiler, tmp_path, controller)
+    for seed in (1, 2, 3):
+        log = bench.log(Machine(), noisy.excitation.reference, noise=2.0, seed=seed)
+        for name in ("I", "F1"):
+            peak = np.max(np.abs(log[name]))
+            assert still.excitation.peaks[name] < 0.9 * peak
+            assert 0.8 * noisy.excitation.peaks[name] < peak < 1.1 * noisy.excitation.peaks[name]
+            assert peak < noisy.stop[name]
+        assert np.max(np.abs(log["I"])) > still.stop["I"]
+
+
+def test_with_dry_friction_the_page_does_not_ask_that_logs_lie_in_the_band_of_the_sliding_machine(
+    plan, controller, tmp_path
+):
+    from seaopt.machine.bringup_page import write_bring_up_page
+
+    stand, values = so.plants.high_impedance(), so.plants.thor().update(f_c=60.0, v_s=5e-3)
+    law = so.tune(stand, values, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
+    rubbing = so.bring_up(law, {"stand": stand}, values, samples=5, fractions=())
+    without, with_ = (write_bring_up_page(each, tmp_path / "bringup.html").read_text() for each in (plan, rubbing))
+    assert "must lie" in without and "dry friction" not in without
+    assert "must lie" not in with_ and "It has 60 N of dry friction at the spring" in with_
