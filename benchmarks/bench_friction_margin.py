@@ -17,7 +17,7 @@ from bench_tune_friction import ISSUE, LEAST_RATE, Case, Judge
 from scipy.optimize import differential_evolution
 
 import seaopt as so
-from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.friction import find_friction_margin
 
 ALIASES = np.arange(-150, 151)
 MULTIPLIERS = {

@@ -13,7 +13,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import MPCSpec, command_of, export, force_mpc, passivity
-from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.friction import find_friction_margin
 from seaopt.control.loops.loop import LoopFigures
 from seaopt.errors import ControlError, PlantError
 from seaopt.plants import Actuation, Friction, Port, Sensing, wrapped

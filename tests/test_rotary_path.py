@@ -17,7 +17,7 @@ import pytest
 import seaopt as so
 from seaopt.bench import Chirp, Noise
 from seaopt.control import MPCSpec, export, force_mpc, passivity
-from seaopt.control.laws.limit_cycles import describe_friction
+from seaopt.control.laws.friction import describe_friction
 from seaopt.control.loops.loop import LoopFigures
 from seaopt.control.running.equilibrium import equilibrium
 from seaopt.estimation import Limits, Multisines, design_experiment

@@ -9,7 +9,7 @@ from seaopt.control.compensation.friction import find_motor_friction, find_readi
 from seaopt.control.compensation.gravity import make_gravity_term
 from seaopt.control.compensation.ripple import make_ripple_term
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.friction_margin import take_friction_out
+from seaopt.control.laws.friction import take_friction_out
 from seaopt.control.loops.compensation.ripple_term import CompensateRipple
 from seaopt.control.loops.compensation.stability import CompensationMargin, SpeedReading, compensation_margin
 from seaopt.control.loops.compensation.terms import (

@@ -499,7 +499,7 @@ class Controller(ClosesLoops, Result, Worded):
             command = replace(command, largest=find_range(plant, params), measured_unit=unit)
             design = plant, controller.delay(params)
             controller = replace(controller, command=command, design=design)
-            from seaopt.control.laws.friction_margin import find_friction_margin  # deferred: it knows controllers
+            from seaopt.control.laws.friction import find_friction_margin  # deferred: it knows controllers
 
             figures, friction = controller.close(*design).figures(), find_friction_margin(controller, *design)
             controller = replace(controller, achieved=figures, friction=friction)

@@ -44,10 +44,10 @@ from seaopt.codec import to_content
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import PortFigures
 from seaopt.control.laws.spec import ControllerSpec
-from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import GROWING, Loop
 from seaopt.control.loops.port import Frequencies, PortModel, Response, hold_response, port_of, weigh_passivity
+from seaopt.control.systems.crossings import add_minima, find_crossings
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant

@@ -1,7 +1,7 @@
 """A sampled loop with its friction taken out, as a port from friction efforts to what they move.
 
 The test of stability looks at it at all aliases of an angle (`seaopt.control.loops.absolute_stability`), describing
-functions at the fundamental alone (`seaopt.control.laws.limit_cycles`).
+functions at the fundamental alone (`seaopt.control.laws.friction`).
 """
 
 from __future__ import annotations

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from seaopt.control.loops.crossings import add_minima, find_crossings
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.peaks import HALF_POWER, TRACKING, find_extremes, find_least
 from seaopt.control.loops.response import ClosedLoop, close
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import Frequencies, Response
+from seaopt.control.systems.crossings import add_minima, find_crossings
 from seaopt.formatting import format_number
 from seaopt.records import record
 from seaopt.signals import ComplexN, VectorK, VectorN

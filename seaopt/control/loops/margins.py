@@ -22,9 +22,9 @@ from dataclasses import field
 
 import numpy as np
 
-from seaopt.control.loops.crossings import add_minima, count_turns
 from seaopt.control.loops.loop import GRID_LOWEST_HZ, GROWING, STABLE, Loop
 from seaopt.control.loops.peaks import find_extremes
+from seaopt.control.systems.crossings import add_minima, count_turns
 from seaopt.errors import ControlError
 from seaopt.records import record
 from seaopt.signals import VectorM

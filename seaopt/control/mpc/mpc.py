@@ -34,7 +34,7 @@ from jaxtyping import Float
 from seaopt.control.laws.command import Command, command_of, limit_notes
 from seaopt.control.laws.controller import ClosesLoops
 from seaopt.control.laws.delay import settle_delays, warn_delays
-from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.friction import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.realisation import check_guards

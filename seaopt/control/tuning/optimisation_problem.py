@@ -61,16 +61,13 @@ from seaopt.control.laws.structures import (
     evaluate_terms,
 )
 from seaopt.control.laws.verdict import list_broken_limits
-from seaopt.control.loops.absolute_stability import (
-    SIMPLEST,
-    FrictionMargin,
-    friction_margin,
-)
+from seaopt.control.loops.absolute_stability import SIMPLEST, FrictionMargin, friction_margin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import MeasuredPlant
+from seaopt.control.loops.moved_link import MovedLinks, close_plant
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.port import PortModel, weigh_passivity
 from seaopt.control.loops.sampled_plant import DigitalPlant
@@ -113,7 +110,6 @@ from seaopt.control.tuning.law_numbers import (
     least_integral_rate,
     warp_frequency,
 )
-from seaopt.control.tuning.moved_links import MovedLinks, close_plant
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 
@@ -325,7 +321,8 @@ class Task:
 
     def enclosed(self, outer: OuterLoop, per_effort: float) -> Task:
         """Return the task with an outer loop around the plants whose links move. `per_effort` is the command's."""
-        return replace(self, moved=MovedLinks.of(outer, self.models, self.signals, per_effort, self.spec))
+        timing = self.spec.sample_time_s, self.spec.loop_delay_samples
+        return replace(self, moved=MovedLinks.of(outer, self.models, self.signals, per_effort, *timing))
 
     def law_of(self, x: LawNumbers) -> Law:
         """Return the law of a vector, not balanced."""

@@ -23,7 +23,7 @@ import numpy as np
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import place_drive_delay, settle_delays, take_own_delays
-from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.friction import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CASCADE, CUSTOM, DisturbanceObserver, Nominal, SpeedLoop
@@ -39,6 +39,7 @@ from seaopt.control.loops.law import Law, make_static_law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import DiscLoop, measure_all_discs
 from seaopt.control.loops.measured.plant import MeasuredPlant
+from seaopt.control.loops.moved_link import close_plant
 from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import (
     DRIVE_DELAY,
@@ -55,7 +56,6 @@ from seaopt.control.tuning.found_law import FoundLaw, Surround, find_law, meet_o
 from seaopt.control.tuning.frequencies import count_growing
 from seaopt.control.tuning.grid import FRICTION, PlantWithFriction, Response
 from seaopt.control.tuning.law_numbers import LawNumbers
-from seaopt.control.tuning.moved_links import close_plant
 from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Task
 from seaopt.control.tuning.solution import (
     ROOM,

@@ -28,6 +28,7 @@ FEW = 8  # steps in every sample that are not worth a choice
 WORTH = 0.5  # of the steps that the same number in every sample takes
 GRAIN = 4.0  # numbers of steps in an octave of them: without a compiler each number is code of its own
 TINY = 1e-300
+Samples = Float[np.ndarray, " m"]
 
 
 def share_steps(problem: FitProblem, z: Vector, steps: Mapping[str, int]) -> FitProblem:
@@ -129,7 +130,7 @@ def _share(experiment: FitExperiment, z: Vector, steps: int) -> FitExperiment:
     return replace(_with_shares(experiment, np.split(shares, ends, axis=1)), substeps=int(most))
 
 
-def _measure(experiment: FitExperiment, z: Vector) -> tuple[Vector, Vector, Vector]:
+def _measure(experiment: FitExperiment, z: Vector) -> tuple[Samples, Samples, Samples]:
     """Return of every sample the steps that it takes, by how much half as long ones change its next state over each
     state's size, and how many steps are stable there or in the samples next to it.
     """
@@ -137,7 +138,7 @@ def _measure(experiment: FitExperiment, z: Vector) -> tuple[Vector, Vector, Vect
     passes = [experiment.run(segment, z, sums=False, states=True, changes=True) for segment in experiment.segments]
     states = np.concatenate([each.states for each in passes if each.states is not None])
     size = np.maximum(np.sqrt(np.mean(states**2, axis=0)), TINY)
-    parts = list[tuple[Vector, ...]]()
+    parts = list[tuple[Samples, ...]]()
     for segment, each in zip(experiment.segments, passes, strict=True):
         assert each.changes is not None and each.states is not None
         here = find_stable_steps(experiment.model, point, segment.samples, each.states)

@@ -14,7 +14,7 @@ import numpy as np
 
 from seaopt.codec import OrInfinite
 from seaopt.control import Controller
-from seaopt.control.laws.friction_margin import find_friction_margin, find_friction_margins
+from seaopt.control.laws.friction import find_friction_margin, find_friction_margins
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.executors import Shared

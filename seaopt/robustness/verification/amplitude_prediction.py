@@ -1,6 +1,6 @@
 r"""The response to a sine of finite amplitude, predicted by describing functions of friction and of saturation.
 
-Friction above its flattest slope is replaced by :math:`N(V)` (`seaopt.control.laws.limit_cycles`), the current limit by
+Friction above its flattest slope is replaced by :math:`N(V)` (`seaopt.control.laws.friction`), the current limit by
 
 .. math:: \sigma(x) = \frac{2}{\pi} \Big( \arcsin x + x \sqrt{1 - x^2} \Big), \qquad x = F_\mathrm{sat} / U \le 1,
 
@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control import Controller
-from seaopt.control.laws.friction_margin import take_friction_out
-from seaopt.control.laws.limit_cycles import AMPLITUDES, describe_friction
+from seaopt.control.laws.friction import AMPLITUDES, describe_friction, take_friction_out
 from seaopt.control.loops.friction_loop import FUNDAMENTAL
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.control import Controller
-from seaopt.control.laws.limit_cycles import LimitCycle, predict_limit_cycles
+from seaopt.control.laws.friction import LimitCycle, predict_limit_cycles
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import at_rest, run_loop
 from seaopt.errors import SimulationError

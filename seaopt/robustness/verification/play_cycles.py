@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.limit_cycles import LimitCycle
+from seaopt.control.laws.friction import LimitCycle
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import find_rows, hold
 from seaopt.parameters import ParameterSet

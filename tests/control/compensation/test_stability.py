@@ -12,7 +12,7 @@ import seaopt as so
 from seaopt.control import CompensateFriction, SampledLoop, add_compensation, run_loop, runnable
 from seaopt.control.compensation.compensate import find_compensation_margins
 from seaopt.control.compensation.friction import find_motor_friction, find_velocity_per_rate
-from seaopt.control.laws.friction_margin import take_friction_out
+from seaopt.control.laws.friction import take_friction_out
 from seaopt.control.loops.compensation import stability
 from seaopt.control.loops.compensation.stability import SpeedReading, compensation_margin
 

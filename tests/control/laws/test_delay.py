@@ -14,7 +14,7 @@ from scipy.signal import cont2discrete
 import seaopt as so
 from seaopt.control import MPCSpec, draw, force_mpc, read_law
 from seaopt.control.laws.delay import describe_delays, find_drive, settle_delays, split_delayed, warn_delays
-from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.friction import find_friction_margin
 from seaopt.control.laws.passivity import passivity
 from seaopt.control.loops.port import probe_of
 from seaopt.control.loops.sampled_plant import add_drive_delay, find_delay, read_conditions

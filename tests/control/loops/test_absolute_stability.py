@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.control import MPCSpec, force_mpc
-from seaopt.control.laws.friction_margin import find_friction_margin, find_friction_margins
+from seaopt.control.laws.friction import find_friction_margin, find_friction_margins
 from seaopt.control.loops import absolute_stability as proof
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant

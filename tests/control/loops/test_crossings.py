@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from seaopt.control.loops.crossings import add_minima, find_crossings
+from seaopt.control.systems.crossings import add_minima, find_crossings
 
 GRID = np.array([0.0, 1.0, 3.0])
 

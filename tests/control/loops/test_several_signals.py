@@ -18,8 +18,7 @@ from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.sampled_port import SampledPort
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.friction_margin import find_friction_margin
-from seaopt.control.laws.limit_cycles import predict_limit_cycles
+from seaopt.control.laws.friction import find_friction_margin, predict_limit_cycles
 from seaopt.control.loops.sampled_plant import find_signals
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ControlError, FileError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.friction import find_friction_margin
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from tests.control.loops import test_absolute_stability as lifted

@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import beta, binomtest
 
 import seaopt as so
-from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.friction import find_friction_margin
 from seaopt.errors import ControlError
 from seaopt.files import seal, to_json
 from seaopt.parameters import Parameter

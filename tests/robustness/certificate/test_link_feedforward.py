@@ -19,7 +19,7 @@ from seaopt.control import Controller, Impedance, LinkFeedforward, LinkPath, add
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.rendering import apparent_impedance, render
-from seaopt.control.laws.friction_margin import find_friction_margin
+from seaopt.control.laws.friction import find_friction_margin
 from seaopt.control.laws.outer_run import enclose
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, run_loop

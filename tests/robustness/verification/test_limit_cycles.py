@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control.laws.limit_cycles import describe_friction, predict_limit_cycles
+from seaopt.control.laws.friction import describe_friction, predict_limit_cycles
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.errors import SimulationError
 from seaopt.plants.friction import friction_states

@@ -25,12 +25,12 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.codec import OrInfinite, OrNaN
-from seaopt.control.loops.crossings import count_turns, find_crossings
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import DROOP_BAND, FALLEN_ABOVE, GRID_LOWEST_HZ, SHOULDER, SHOULDER_FALL, LoopFigures
 from seaopt.control.loops.measured.plant import ASSUMED, MeasuredPlant
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.loops.transfer_function import Frequencies, Response
+from seaopt.control.systems.crossings import count_turns, find_crossings
 from seaopt.formatting import format_number
 from seaopt.records import record
 

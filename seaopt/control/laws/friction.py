@@ -1,4 +1,7 @@
-r"""Limit cycles of dry friction, predicted by its describing function, where stability is not shown.
+r"""A loop with dry friction: how much of its curves is shown to be stable, and the limit cycles where it is not.
+
+Stability is shown for every friction curve of a sector (`seaopt.control.loops.absolute_stability`). Where that fails,
+limit cycles are predicted by the describing function.
 
 Friction is what its curve :math:`\varphi` has above its flattest slope (the rest is in the plant). A velocity
 :math:`V \sin \omega t` meets a force whose fundamental is :math:`N(V) V \sin \omega t`,
@@ -16,15 +19,17 @@ through; cycles that stick for a while at each turn (hunting of an integral agai
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 from jaxtyping import Complex
 
-from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.friction_margin import take_friction_out
-from seaopt.control.loops.crossings import find_crossings
-from seaopt.control.loops.friction_loop import FUNDAMENTAL, FrictionLoop
+from seaopt.control.laws.controller import ClosesLoops, Controller
+from seaopt.control.loops.absolute_stability import FrictionMargin, friction_margin
+from seaopt.control.loops.friction_loop import FUNDAMENTAL, FrictionLoop, make_friction_loops
 from seaopt.control.loops.transfer_function import Frequencies, Response
+from seaopt.control.systems.crossings import find_crossings
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import friction_slopes, remembers
@@ -45,6 +50,30 @@ class LimitCycle:
     velocity: float  # amplitude of the velocity that the friction acts on, m/s or rad/s
     stable: bool  # the loop comes back to it; an unstable one bounds what a loop recovers from
     state: tuple[float, ...]  # the plant's states at the cycle's largest friction velocity
+
+
+def find_friction_margin(controller: ClosesLoops, plant: Plant, params: ParameterSet) -> FrictionMargin | None:
+    """Return how much steeper friction may be with stability shown, between the samples too; None without friction. The
+    linear plant is the sliding one; what a curve's slope is above its flattest is in the sector. The controller's
+    measurement path closes the loop; the reference stands still; `params` may hold conditions. The factor is zero where
+    the sliding loop is unstable, has an `obstacle` (`FrictionLoop`), or nothing was shown, which does not show an
+    oscillation.
+    """
+    return find_friction_margins(controller, plant, [params])[0]
+
+
+def find_friction_margins(
+    controller: ClosesLoops, plant: Plant, sets: Sequence[ParameterSet], first: str = "", least: float = 0.0
+) -> list[FrictionMargin | None]:
+    """Return `find_friction_margin` at sets of parameters with the same conditions; see `friction_margin`."""
+    loops = take_friction_out(controller, plant, sets)
+    return [None if loop is None else friction_margin(loop, first, least) for loop in loops]
+
+
+def take_friction_out(controller: ClosesLoops, plant: Plant, sets: Sequence[ParameterSet]) -> list[FrictionLoop | None]:
+    """Return `make_friction_loops` of a controller."""
+    late, waits = [controller.delay(params) for params in sets], controller.compute_delay_samples
+    return make_friction_loops(plant, late, controller.signals, controller.per_effort, waits, controller.law)
 
 
 def describe_friction(plant: Plant, params: ParameterSet, name: str, amplitude: Frequencies) -> Frequencies:
