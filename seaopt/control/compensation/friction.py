@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from seaopt.control.loops.compensation.stability import SpeedReading, compensation_margin
 from seaopt.control.loops.compensation.terms import CompensateFriction, FrictionTerm
-from seaopt.control.loops.drift import leave_out_drift
+from seaopt.control.loops.drift import take_linear
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.errors import ControlError
@@ -26,9 +26,7 @@ from seaopt.plants.friction import (
     SMOOTHED,
     friction_matrices,
     friction_states,
-    leave_out_waves,
 )
-from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.roles import Friction
 from seaopt.records import record
 
@@ -172,7 +170,7 @@ def find_velocity_per_rate(plant: Plant, params: ParameterSet, regulated: str, n
     locked = plant
     while locked.port is not None and locked.port.held is not None:
         locked = locked.port.held()
-    locked = leave_out_drift(freeze_heat(leave_out_waves(locked)), regulated)
+    locked = take_linear(locked, regulated)
     values = locked.complete(params)
     a, b, c, _ = state_space(friction_states(locked)[SLIDING], values)
     x, u = find_rest(locked, values)

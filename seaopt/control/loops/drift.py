@@ -25,8 +25,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.plants import Plant
-from seaopt.plants.friction import remembers
+from seaopt.plants.friction import leave_out_waves, remembers
 from seaopt.plants.memo import memo
+from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import jacobians
 from seaopt.plants.roles import Friction, with_values
 from seaopt.signals import MatrixMN, MatrixNN, VectorN
@@ -39,6 +40,13 @@ CANCELLED = 1e-13  # of a row's largest slope
 
 
 Slopes = list[tuple[MatrixNN, Float[np.ndarray, "y n"], Any]]
+
+
+def take_linear(plant: Plant, measured: str | tuple[str, ...]) -> Plant:
+    """Return the plant as linear loops have it: its heat stands still, waves of a position are left out, and so is what
+    drifts (`leave_out_drift`).
+    """
+    return leave_out_drift(freeze_heat(leave_out_waves(plant)), measured)
 
 
 @memo

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from seaopt.control.loops.drift import leave_out_drift
+from seaopt.control.loops.drift import take_linear
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import (
@@ -32,10 +32,8 @@ from seaopt.plants.friction import (
     friction_matrices,
     friction_slopes,
     friction_states,
-    leave_out_waves,
 )
 from seaopt.plants.memo import memo
-from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
 from seaopt.signals import MatrixNN, VectorM, VectorN
 
@@ -120,7 +118,7 @@ def make_friction_loops(
     first) with what friction has above its flattest slope taken out; None without friction. `per_effort`: the command
     for one unit of the law's effort. `delay_samples`: whole samples from measurement to output, besides the hold.
     """
-    plant = leave_out_drift(freeze_heat(leave_out_waves(plant)), measured)
+    plant = take_linear(plant, measured)
     values = [plant.complete(params) for params in sets]
     spans = [np.subtract(*friction_slopes(plant, each)[::-1]) for each in values]
     remembers = [any(find_bristle_stiffness(plant, each)) for each in values]

@@ -25,12 +25,12 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
-from seaopt.control.loops.drift import leave_out_drift
+from seaopt.control.loops.drift import take_linear
 from seaopt.control.systems.block import Block, make_plant
 from seaopt.errors import ControlError, UnitError, suggestion
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.plants.friction import SLIDING, friction_states, leave_out_waves, remembers, rest_jacobians
+from seaopt.plants.friction import SLIDING, friction_states, remembers, rest_jacobians
 from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import DRIVE_DELAY, dynamics_function, refuse_samples
@@ -236,7 +236,7 @@ def linearise(
     plant holds samples.
     """
     refuse_samples(plant)
-    plant = leave_out_drift(freeze_heat(leave_out_waves(plant)), measured)
+    plant = take_linear(plant, measured)
     blocks = _evaluate_jacobians(plant, *_solve_rest(_let_slide(plant), p, at), p)
     return _pick(blocks, find_rows(plant, measured), gain)
 
@@ -343,7 +343,7 @@ def differentiate_linearisation(
     gain: float,
 ) -> tuple[LinearPlants, LinearPlants]:
     """Return what `linearise` does, and its derivatives along (dp, dat): CasADi's, the rest's own motion included."""
-    plant = leave_out_drift(freeze_heat(leave_out_waves(plant)), measured)
+    plant = take_linear(plant, measured)
     sliding = _let_slide(plant)
     rows, names = find_rows(plant, measured), list(plant.states)
     x, u = _solve_rest(sliding, p, at)

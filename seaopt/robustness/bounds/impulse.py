@@ -16,10 +16,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control import Controller
-from seaopt.control.loops.drift import leave_out_drift
+from seaopt.control.loops.drift import take_linear
 from seaopt.control.loops.sampled_plant import DELAYS, find_rows
 from seaopt.plants import Plant, jacobians
-from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.records import record
 from seaopt.robustness.bounds.enclosure import Entry, assemble_matrix, count_halvings, enclose
 from seaopt.robustness.bounds.region import Boxes, Region
@@ -43,7 +42,7 @@ class ImpulseTransfer:
 
 def enclose_plant(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> ImpulseTransfer:
     """Return the sampled plant over boxes, from motor force to every measured output."""
-    plant = leave_out_drift(freeze_heat(plant), controller.signals)
+    plant = take_linear(plant, controller.signals)
     degree = DEGREES[within.size] if within.size < len(DEGREES) else 3
     uncertain = within.enclose(boxes, degree)
     count, over = boxes.centre.shape[0], build_basis(within.size, degree)
