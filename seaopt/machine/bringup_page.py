@@ -19,7 +19,6 @@ from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
 from seaopt.reporting.sections.kinds.controller import say_bandwidths, show_stuck_bandwidth
-from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.units import unit_after
 
 PARTS = {"stages": "Stages", "provenance": "Provenance"}
@@ -241,12 +240,12 @@ def write_bring_up_page(
         {"heading": stage.name, "text": "", "charts": [make_chart(panel) for panel in _list_panels(stage)]}
         for stage in result.stages
     ]
-    verdict = judge(result, Commands())
     return write_result_page(
         path,
         title=title,
         parts=PARTS,
-        verdict=verdict if fit_met or verdict is None else doubt_design(verdict),
+        verdict=judge(result, Commands()),
+        fit_met=fit_met,
         glance=summarise(result),
         sections=[*describe(result), describe_provenance((), files, command)],
         plates={"stages": plates},

@@ -31,7 +31,6 @@ from seaopt.reporting.sections.data import (
     mark_met,
 )
 from seaopt.reporting.sections.kinds.controller import say_bandwidths, show_stuck_bandwidth
-from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.units import unit_after
 
 PARTS = {
@@ -433,12 +432,12 @@ def write_acceptance_page(
     FileError
         The folder cannot be written.
     """
-    verdict = judge(result, Commands())
     return write_result_page(
         path,
         title=title,
         parts=PARTS,
-        verdict=verdict if fit_met or verdict is None else doubt_design(verdict),
+        verdict=judge(result, Commands()),
+        fit_met=fit_met,
         glance=summarise(result),
         sections=[*describe(result), describe_provenance((), files, command)],
         plates={
