@@ -62,16 +62,16 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
     name.
     """
     whole = make_setting(source, ticks)
-    match = play(whole)
+    match, found = play(whole), None
     if match.met:
-        whole, match = _read_counts(whole, match, others or {})
+        whole, match, found = _read_counts(whole, match, others or {})
     ticks_per_row = 1 if match.met else count_ticks_per_row(whole.controller, ticks)
     lines = match_lines(whole, ticks_per_row, others or {}) if ticks_per_row > 1 else None
     if lines is not None and lines.tells:
         return _describe_lines(whole, lines, ticks_per_row)
     late, causes = 0, ()
     if not match.met:
-        causes, changed = find_causes(whole, match, others or {})
+        causes, changed = found or find_causes(whole, match, others or {})
         first = causes[0] if causes else None
         limited = find_saturated(ticks, whole.linear.command_limit) > 0.5  # where all laws are alike
         if lines is not None and (limited or first is None or not first.explains):
@@ -105,17 +105,21 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
     )
 
 
-def _read_counts(whole: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[Setting, Match]:
-    """Return a setting that is met, and its match, with readings that are not rounded in the log if they are not."""
+def _read_counts(
+    whole: Setting, match: Match, others: Mapping[str, Controller]
+) -> tuple[Setting, Match, tuple[tuple[Cause, ...], Setting] | None]:
+    """Return a setting that is met, and its match, with readings that are not rounded in the log if they are not; and
+    what `find_causes` found, where that shows that they are not.
+    """
     counts = replace(whole, rounded=False)
     as_read = play(counts)
     if as_read.met:
-        return counts, as_read
+        return counts, as_read, None
     if as_read.energy > (HIDES * float(np.std(whole.ticks.command))) ** 2:
-        causes, _ = find_causes(counts, as_read, others)
+        causes, changed = find_causes(counts, as_read, others)
         if causes and causes[0].explains:
-            return counts, as_read
-    return whole, match
+            return counts, as_read, (causes, changed)
+    return whole, match, None
 
 
 def _describe_lines(setting: Setting, match: LineMatch, ticks_per_row: int) -> Replay:
