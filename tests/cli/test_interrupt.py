@@ -15,6 +15,7 @@ import seaopt as so
 from seaopt.cli import main
 from seaopt.cli.main import app
 from seaopt.cli.session import Session
+from tests.cli.test_session import BENCH as FITTED
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
 
@@ -57,27 +58,14 @@ def test_ctrl_c_is_one_line_and_exits_130(tmp_path, monkeypatch, capsys, design)
     assert told[-1] == f"seaopt: interrupted; what was finished is in {tmp_path / 'out'}"
 
 
-BENCH = """
-schema = 1
-[parameters]
-J = { value = 3e-6, free = true, min = 1e-8, max = 1e-4 }
-[plant.stand]
-kind = "high_impedance"
-[[experiment]]
-name = "lines"
-plant = "stand"
-[experiment.virtual]
-seed = 1
-duration_s = 2
-rate_hz = 400
-noise_std = { F1 = 2.0 }
-truth = { J = 3.31e-6 }
-excitation = { multisine = { amplitudes = [1.0, 1.0], frequencies_hz = [5.0, 15.0] } }
-[controller]
+BENCH = (
+    FITTED
+    + """[controller]
 plant = "stand"
 measured = "F1"
 bandwidth_hz = 30
 """
+)
 KILLED = """
 import os, signal, sys
 import seaopt.estimation
