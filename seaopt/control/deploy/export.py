@@ -203,12 +203,9 @@ def export(
         context |= describe_log(context, law, names, log_rows, units=units, digest=digest)
         templates |= LOG_TEMPLATES
         if stop is not None:
-            context |= {"stops": describe_stops(stop, stored.signals, units, name_unit(stored.command))}
-            context |= {
-                "unwatched": describe_unwatched(
-                    stop, stored.signals, units | {stored.command.input: stored.command.unit}
-                )
-            }
+            context["stops"] = describe_stops(stop, stored.signals, units, name_unit(stored.command))
+            units |= {stored.command.input: stored.command.unit}
+            context["unwatched"] = describe_unwatched(stop, stored.signals, units)
             templates |= STAGE_TEMPLATES
     if tare is not None:
         require_type(tare, Tare, "tare", "give a Tare", ControlError)

@@ -125,8 +125,7 @@ class MovedLinks:
             position = find_position(plant, outer)
             if position is None:
                 return None
-            read = (*signals, position)
-            sampled = sample(plant, values, read, per_effort, sample_time_s, delay_samples)
+            sampled = sample(plant, values, (*signals, position), per_effort, sample_time_s, delay_samples)
             return sampled, keep_share(position)
 
         return cls(outer=outer, plants=tuple(map(read, models)))

@@ -57,10 +57,7 @@ from seaopt.control.tuning.frequencies import count_growing
 from seaopt.control.tuning.grid import FRICTION, PlantWithFriction, Response
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Task
-from seaopt.control.tuning.solution import (
-    ROOM,
-    feed_link,
-)
+from seaopt.control.tuning.solution import ROOM, feed_link
 from seaopt.errors import ControlError, InternalError, SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values

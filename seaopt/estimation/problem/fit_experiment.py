@@ -81,9 +81,8 @@ class FitExperiment:
     loss: Loss  # applied to residuals in sigma
     band_hz: tuple[float, float] | None = None  # residuals are filtered to this band
     holdout: float = 0.0  # last fraction of the log that gets no weight
-    substeps: int = (
-        1  # least number of integration steps per sample, their peak where they are shared out; see `count_steps`
-    )
+    # Least number of integration steps per sample, their peak where they are shared out; see `count_steps`.
+    substeps: int = 1
     halved: bool = False  # whether each of them is made in two
     predictor: SteadyStateFilter | None = None  # with one, the residual is the error of the prediction one sample ahead
 
