@@ -262,7 +262,7 @@ def _check_header(source: Source, log: Log, row: Replay, others: Mapping[str, Co
 def _hash(source: Source) -> str:
     """Return what tells a law from any other, as the log of the target has it; of predictive control its linear law."""
     if isinstance(source, ScheduledController):
-        return hash_law(source.runnable(), source.controllers[0].outer)
+        return hash_law(source.runnable(), source.outer)
     source = stand(source, None)
     return hash_law(runnable(source), source.outer)
 

@@ -103,6 +103,11 @@ class ScheduledController(Result, Worded):
         return self.controllers[0].command
 
     @property
+    def outer(self) -> OuterLoop | None:
+        """The outer loop, one around all points; None without."""
+        return self.controllers[0].outer
+
+    @property
     def design(self) -> tuple[Plant, ParameterSet]:
         """The design plant, and its parameters at the first point."""
         design = self.controllers[0].design
@@ -193,7 +198,7 @@ class ScheduledController(Result, Worded):
             frozen = self.controllers[self.points.index(value)]
         else:
             spec, first = replace(self.spec, bandwidth_hz=self.asked_hz(value)), self.controllers[0]
-            frozen = freeze(self.table, value, spec, self.design, self.others, first.outer)
+            frozen = freeze(self.table, value, spec, self.design, self.others, self.outer)
             (i, t), terms = self.table.find_stretch(value), [each.compensation for each in self.controllers]
             low, high = terms[i], terms[i + 1]
             mixed = None if low is None or high is None else low.mix(high, t)
@@ -215,7 +220,7 @@ class ScheduledController(Result, Worded):
     def _judge_place(self, value: float) -> PlaceFigures:
         """Judge the law at a value between the points: all limits, and 0.9 of the bandwidth that is asked there."""
         asked, spec = self.asked_hz(value), replace(self.spec, bandwidth_hz=self.asked_hz(value))
-        frozen, loops = _freeze(self.table, value, spec, self.design, self.others, self.controllers[0].outer)
+        frozen, loops = _freeze(self.table, value, spec, self.design, self.others, self.outer)
         measured = {loop.name: loop.figures for loop in loops}
         others = place_plants(self.others, self.over, value).items()
         closed = (measured.get(name) or close_outer(frozen, *case).figures() for name, case in others)
@@ -309,7 +314,7 @@ def _make_runnable(
         command=(schedule.command.input, schedule.command.unit),
         compensations=[each.compensation for each in schedule.controllers],
     )
-    around = first.outer if outer else None
+    around = schedule.outer if outer else None
     return replace(law, gate=first.gate, heat=first.heat_guard if first.derate else None, outer=around)
 
 

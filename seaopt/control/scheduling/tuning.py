@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -38,20 +39,21 @@ from seaopt.control.scheduling.scheduled_controller import (
     place_variable,
 )
 from seaopt.control.tuning.convex_concave import improve
-from seaopt.control.tuning.found_law import OUTER_ROUNDS
+from seaopt.control.tuning.found_law import FoundLaw, meet_outer
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.interior_point import refine
 from seaopt.control.tuning.law_numbers import K_I, K_P, LawNumbers, read_numbers
 from seaopt.control.tuning.optimisation_problem import Task
-from seaopt.control.tuning.solution import Solution, follow_task, recheck, solve
+from seaopt.control.tuning.solution import Solution, recheck, solve
 from seaopt.control.tuning.tuner import Draws, RobustTo, make_controller, make_task, tune
-from seaopt.errors import ControlError, SeaoptError, require_type
+from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, count_off, divide, ignore
+from seaopt.records import record
 
 ANOTHER_VALLEY = 10.0  # factor by which an integral's rate differs between two of the tuner's valleys
 Chain = list[Solution]  # of every point
@@ -152,16 +154,17 @@ def tune_schedule(
     ]
     tasks = [_share_nominal(task, tasks[len(tasks) // 2]) for task in tasks]
 
-    def make(tasks: Sequence[Task], chain: Chain) -> ScheduledController:
-        """Return the schedule of a chain."""
+    @cache
+    def make(found: _FoundChain) -> ScheduledController:
+        """Return the schedule of what was found at the points."""
         controllers: list[Controller] = []
-        for (at_point, at_points), task, (x, loops) in zip(placed, tasks, chain, strict=True):
+        for (at_point, at_points), law in zip(placed, found.laws, strict=True):
             # What blocks, and what is possible instead, is for the tuner to say; its observer would have another plant.
-            if task.nominal is None and _breaks_limits(task, loops):
-                around = None if task.moved is None else _give(task.moved.outer)
-                controllers.append(tune(plant, at_point, task.spec, at_points, draws=draws, outer=around))
+            if law.task.nominal is None and law.missed:
+                around = None if law.task.moved is None else _give(law.task.moved.outer)
+                controllers.append(tune(plant, at_point, law.task.spec, at_points, draws=draws, outer=around))
             else:
-                controllers.append(make_controller(task, x, loops, (plant, at_point)))
+                controllers.append(make_controller(law.task, law.x, law.loops, (plant, at_point)))
         make_table(over, unit, tuple(places.tolist()), tuple(controllers))  # refuses gains that cannot be interpolated
         return ScheduledController(
             over=over,
@@ -173,55 +176,51 @@ def tune_schedule(
         ).with_places()
 
     alone, around = divide(progress, 1.0, 1.0 * (outer is not None))
-    chain, *further = _rank_chains(tasks, None if near is None else _follow_schedule(tasks, points, near), alone)
-    schedule = make(tasks, chain)
-    if _count_hops(chain) and not schedule.met:
-        schedule, chain = min(
-            [(schedule, chain), *((make(tasks, each), each) for each in further)],
-            key=lambda made: sum(bool(place.broken) for place in made[0].between),
-        )
+    chains = _rank_chains(tasks, None if near is None else _follow_schedule(tasks, points, near), alone)
+    found, *further = [_FoundChain.of(tasks, chain) for chain in chains]
+    if _count_hops(chains[0]) and not make(found).met:
+        found = min([found, *further], key=lambda each: sum(bool(place.broken) for place in make(each).between))
     if outer is not None:
-        schedule = _meet_outer(tasks, chain, schedule, make, outer, around)
+        found = meet_outer(found, make, outer, around)
+    schedule = make(found)
     progress(f"{places.size} points over {over}", 1.0)
     return replace(schedule, fallback=_choose_fallback(schedule))
 
 
+@record(eq=False)
+class _FoundChain:
+    """The laws that were found at the points of a schedule."""
+
+    laws: tuple[FoundLaw, ...]
+
+    @classmethod
+    def of(cls, tasks: Sequence[Task], chain: Chain) -> _FoundChain:
+        """Return the laws of a chain."""
+        pairs = zip(tasks, chain, strict=True)
+        return cls(laws=tuple(FoundLaw(task=task, x=x, loops=loops) for task, (x, loops) in pairs))
+
+    @property
+    def missed(self) -> float:
+        """The worst usage of a limit that is missed at a point; 0 where none is."""
+        return max(law.missed for law in self.laws)
+
+    def enclose(self, outer: OuterLoop, per_effort: float) -> _FoundChain:
+        """Return the laws measured with an outer loop."""
+        return _FoundChain(laws=tuple(law.enclose(outer, per_effort) for law in self.laws))
+
+    def follow(self, progress: Progress, *, first: bool) -> _FoundChain:
+        """Return the laws found from these, near each that misses a limit, and where that is not enough at `first` all
+        of them anew.
+        """
+        near = _FoundChain(laws=tuple(law.follow(ignore, first=False) if law.missed else law for law in self.laws))
+        if not first or not near.missed:
+            return near
+        tasks = [law.task for law in self.laws]
+        return _FoundChain.of(tasks, _rank_chains(tasks, None, progress)[0])
+
+
 def _give(outer: OuterLoop) -> Callable[[Controller], OuterLoop]:
     return lambda _: outer
-
-
-def _meet_outer(
-    tasks: Sequence[Task],
-    chain: Chain,
-    schedule: ScheduledController,
-    make: Callable[[Sequence[Task], Chain], ScheduledController],
-    outer: Callable[[ScheduledController], OuterLoop | None],
-    progress: Progress,
-) -> ScheduledController:
-    """Return a schedule that keeps its limits with the outer loop that it gets, from one that was found without, as
-    `seaopt.tune` does a law: each point from its own numbers, and where that breaks a limit all from a scan.
-    """
-    for number in range(OUTER_ROUNDS + 1):
-        try:
-            asked = outer(schedule)
-        except SeaoptError:
-            if schedule.met:
-                raise
-            return schedule
-        if asked is None or asked == schedule.controllers[0].outer:
-            return schedule
-        tasks = [task.enclosed(asked, schedule.command.per_effort) for task in tasks]
-        chain = [(x, task.measure(x)) for task, (x, _) in zip(tasks, chain, strict=True)]
-        broken = _list_missed(tasks, chain)
-        if broken and number < OUTER_ROUNDS:
-            for k in broken:
-                chain[k] = follow_task(tasks[k], *chain[k])
-            if number == 0 and _list_missed(tasks, chain):
-                chain = _rank_chains(tasks, None, progress)[0]
-        schedule = make(tasks, chain)
-        if not broken:
-            break
-    return schedule
 
 
 def _pair_plants(robust_to: Mapping[str, Any], values: ParameterSet) -> Plants:
@@ -338,11 +337,6 @@ def _follow_schedule(tasks: Sequence[Task], points: Sequence[float], near: Sched
         if _breaks_limits(task, reached[k][1]):
             return None
     return [reached[k] for k in range(len(tasks))]
-
-
-def _list_missed(tasks: Sequence[Task], chain: Chain) -> list[int]:
-    """Return the points at which a limit is broken."""
-    return [k for k, (task, (_, loops)) in enumerate(zip(tasks, chain, strict=True)) if _breaks_limits(task, loops)]
 
 
 def _breaks_limits(task: Task, loops: Sequence[MeasuredLoop]) -> bool:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Protocol, Self, TypeVar
 
+from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.verdict import PossibleBandwidths
@@ -33,6 +35,46 @@ OUTER_ROUNDS = 6  # of tuning with an outer loop that follows
 Surround = Callable[[Controller], OuterLoop | None]
 
 
+class Enclosed(Protocol):
+    """What an outer loop is around: a controller, or a schedule of them."""
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met."""
+        ...
+
+    @property
+    def command(self) -> Command:
+        """What is commanded for an effort."""
+        ...
+
+    @property
+    def outer(self) -> OuterLoop | None:
+        """The outer loop that it was measured with."""
+        ...
+
+
+class Found(Protocol):
+    """What was found of a task, or of the tasks of a schedule."""
+
+    @property
+    def missed(self) -> float:
+        """The worst usage of a limit that is missed; 0 where none is."""
+        ...
+
+    def enclose(self, outer: OuterLoop, per_effort: float) -> Self:
+        """Return it measured with an outer loop."""
+        ...
+
+    def follow(self, progress: Progress, *, first: bool) -> Self:
+        """Return what is found from it; `first`: also what takes a search of its own."""
+        ...
+
+
+FoundT = TypeVar("FoundT", bound=Found)
+EnclosedT = TypeVar("EnclosedT", bound=Enclosed)
+
+
 @record(eq=False)
 class FoundLaw:
     """A law that was found, and what is possible where it misses a limit."""
@@ -47,40 +89,50 @@ class FoundLaw:
         """The worst usage of a limit that is missed; 0 where none is."""
         return max(measure_missed(self.task, self.loops).values(), default=0.0)
 
+    def enclose(self, outer: OuterLoop, per_effort: float) -> FoundLaw:
+        """Return the law measured with an outer loop."""
+        task = self.task.enclosed(outer, per_effort)
+        return FoundLaw(task=task, x=self.x, loops=task.measure(self.x), possible=self.possible)
+
+    def follow(self, progress: Progress, *, first: bool) -> FoundLaw:
+        """Return the law found from this one, at first by all means, then near it."""
+        if first:
+            return find_law(self.task, (self.x,), progress)
+        x, loops = follow_task(self.task, self.x, self.loops)
+        return FoundLaw(task=self.task, x=x, loops=loops)
+
 
 def meet_outer(
-    found: FoundLaw, describe: Callable[[FoundLaw], Controller], outer: Surround, progress: Progress
-) -> FoundLaw:
-    """Return a law that keeps its limits with the outer loop that it gets, from one that was found without; where none
-    does, the one that misses least. Damping that is critical is another around each law: where that takes one beyond a
-    limit, the law follows it.
+    found: FoundT,
+    describe: Callable[[FoundT], EnclosedT],
+    outer: Callable[[EnclosedT], OuterLoop | None],
+    progress: Progress,
+) -> FoundT:
+    """Return what keeps its limits with the outer loop that it gets, from what was found without; where nothing does,
+    what misses least. Damping that is critical is another around each law: where that takes one beyond a limit, the law
+    follows it.
     """
-    tried: list[FoundLaw] = []
+    tried: list[FoundT] = []
     for number in range(OUTER_ROUNDS + 1):
-        controller = describe(found)
+        law = describe(found)
         try:
-            asked = outer(controller)
+            asked = outer(law)
         except SeaoptError:
-            if controller.met and not tried:
+            if law.met and not tried:
                 raise
             break  # around a law that misses its limits, or one that follows, there may be none
         if asked is None:
             break
-        if asked == controller.outer:
+        if asked == law.outer:
             tried.append(found)
             break
-        task = found.task.enclosed(asked, controller.command.per_effort)
-        found = FoundLaw(task=task, x=found.x, loops=task.measure(found.x), possible=found.possible)
+        found = found.enclose(asked, law.command.per_effort)
         tried.append(found)
         if not found.missed or number == OUTER_ROUNDS:
             break
         progress("tuning with the outer loop", number / OUTER_ROUNDS)
-        if number:
-            x, loops = follow_task(task, found.x, found.loops)
-            found = FoundLaw(task=task, x=x, loops=loops)
-        else:
-            found = find_law(task, (found.x,), ignore)
-    return min(tried, key=lambda law: law.missed) if tried else found
+        found = found.follow(ignore, first=not number)
+    return min(tried, key=lambda each: each.missed) if tried else found
 
 
 def find_law(task: Task, warm: Sequence[LawNumbers], progress: Progress) -> FoundLaw:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from functools import cache, partial
+from types import SimpleNamespace
 
 import casadi as ca
 import control
@@ -17,10 +19,12 @@ from seaopt.control.laws.command import command_of
 from seaopt.control.running.fed_back import close_whole, split_states
 from seaopt.control.tuning import interior_point
 from seaopt.control.tuning.convex_concave import linearise_law
+from seaopt.control.tuning.found_law import meet_outer
 from seaopt.control.tuning.frequencies import make_grid
 from seaopt.control.tuning.optimisation_problem import SCOPES, Task
 from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError
+from seaopt.progress import ignore
 
 TS, T_V = 1e-3, 5e-3
 HELD, KNEE, FREE = (so.plants.rotary(link) for link in ("locked", "pendulum", "free"))
@@ -360,3 +364,40 @@ def test_an_outer_loop_that_is_refused_is_an_error():
         so.tune(HELD, VALUES, OF_KNEE, {"knee": KNEE}, outer=refuse)
     law = so.tune(HELD, VALUES, replace(OF_KNEE, max_noise_gain=1.0), {"knee": KNEE}, outer=refuse)
     assert not law.met and law.outer is None
+
+
+class Steps:
+    """What misses its limits by a number for each outer loop that it was measured with, and is not found better."""
+
+    met, command = True, SimpleNamespace(per_effort=1.0)
+
+    def __init__(self, missed, outer=None):
+        self.misses, self.outer, self.missed = missed, outer, 0.0 if outer is None else missed[outer]
+
+    def enclose(self, outer, _):
+        return Steps(self.misses, outer)
+
+    def follow(self, _, *, first):
+        return Steps(self.misses, self.outer)
+
+
+@pytest.mark.parametrize(("missed", "taken"), [([1.3, 1.1, 1.2], 1), ([1.3, 1.1, 0.0, 0.0], 2), ([1.2] * 9, 0)])
+def test_what_misses_its_limits_least_is_taken(missed, taken):
+    calls = itertools.count()
+    found = meet_outer(Steps(missed), lambda one: one, lambda _: min(next(calls), len(missed) - 1), ignore)
+    assert found.outer == taken
+
+
+@pytest.mark.slow
+def test_a_schedule_that_misses_its_limits_misses_them_least_of_what_was_tried():
+    """With a damping that gets less each time it is asked for, of which the first is already too little."""
+    asked, loose = [], replace(ASKED, stiffness=80.0, damping=1.2)
+
+    def weaken(schedule):
+        damping = 1.2 - 0.2 * min(len(asked), 2)
+        asked.append(give_outer(replace(loose, damping=damping), schedule.controllers[0]).outer)
+        return asked[-1]
+
+    schedule = tune_schedule(HELD, VALUES, OF_KNEE, "k_s", [250.0, 300.0], {"knee": KNEE}, outer=weaken)
+    assert not schedule.met and len({one.impedance.damping for one in asked}) == 3
+    assert schedule.outer == asked[0]

@@ -23,7 +23,6 @@ import numpy as np
 
 from seaopt.control import Controller, ControllerSpec, ScheduledController, tune, tune_schedule
 from seaopt.control.laws.delay import settle_delays
-from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_table, format_values, html_text
@@ -224,7 +223,7 @@ def tune_certified(
     values = (others or ParameterSet()).with_parameters(*fitted.values())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
     share, asked = 1.0 - (1.0 - confidence) / rounds, spec
-    outer = None if complete is None else partial(_find_outer, complete)
+    outer = None if complete is None else lambda law: complete(law).outer
 
     def tune_at(bandwidth_hz: float) -> Controller:
         law = tune(plant, values, replace(asked, bandwidth_hz=bandwidth_hz), robust_to, draws=draws, outer=outer)
@@ -285,12 +284,6 @@ def tune_certified(
         progress(f"{status} after {format_count(number, 'round')}", 1.0)
         return JointTuning(status=status, rounds=tuple(finished), robust_to=witnesses, relief=relief, **made)
     raise AssertionError("the last round has a status")
-
-
-def _find_outer(complete: Callable[[Any], Any], law: Controller | ScheduledController) -> OuterLoop | None:
-    """Return the outer loop of what runs of a tuned law."""
-    whole = complete(law)
-    return (whole.controllers[0] if isinstance(whole, ScheduledController) else whole).outer
 
 
 def _list_over(certificate: Certificate) -> list[Look]:
