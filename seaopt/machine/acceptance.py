@@ -163,6 +163,10 @@ def accept(
     position is in the log; no response follows. A reference in N or N m is the one that the force law was given, or,
     without a stiffness, the force that the outer loop's damping is added to: whichever the law makes the command of.
 
+    Law and log go by ticks, and so does the clock of a log that has none of its own: a law that is stepped at another
+    rate makes the logged command all the same. The machine goes by seconds, and its response tells the rate; then all
+    of the response is stated in the machine's seconds.
+
     A schedule is replayed as its variable moves; its response is judged where that stands still, against the figures
     that the law has there. Predictive control is replayed with its limits; its response is that of the law while none
     is active.
@@ -244,6 +248,10 @@ def accept(
         return replace(result, response=response, left_out=left_out)
     draws = list_draws(law, uncertainty, ranges, DRAWS, SEED)
     differences = compare(law, response.measured, whole, draws, confidence)
+    first = differences.found[0] if differences is not None and differences.found else None
+    if first is not None and first.kind == "rate" and first.size:  # of the machine's seconds, and none for a fit
+        response = judge_response(law, join_blocks(blocks), confidence, first.size)
+        result = replace(result, experiments=())
     return replace(result, response=response, differences=differences, left_out=left_out)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -23,16 +24,19 @@ def run_design(
     *,
     sensors: Sensors | None = None,
     seed: int = 0,
+    rate: float = 1.0,
 ) -> LoopRun:
     """Return the runs of a law, with its terms and without its guards, on its design plant with each of some values.
-    `sensors`: the errors of what it reads, with noise of `seed`; without them it reads the true outputs.
+    `sensors`: the errors of what it reads, with noise of `seed`; without them it reads the true outputs. `rate`: at
+    which the same numbers are stepped, over that which they were made for.
     """
     assert controller.design is not None
     seen, values = controller.see(controller.design[0]), [controller.delay(each) for each in sets]
     longest = max(float(find_delay(seen, read_conditions(seen, seen.complete(each)))) for each in values)
+    law = runnable(controller, gate=False, heat=False)
     loop = SampledLoop(
         plant=seen,
-        law=runnable(controller, gate=False, heat=False),
+        law=replace(law, sample_time_s=law.sample_time_s / rate),
         measured=controller.signals,
         delay_samples=controller.compute_delay_samples,
         longest_delay_s=longest,

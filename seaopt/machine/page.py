@@ -67,6 +67,10 @@ OPEN = {
     "aliases": "lines of the reference above half of the log's rate come back as others; play slower ones, or log "
     "every tick",
 }
+RATE = (
+    "These figures are in the machine's seconds: the law is stepped at {} times the rate that the log's clock says, "
+    "and all that is read off that clock is wrong."
+)
 STABILITY = (
     "Stability is the least |1 + L| over the radius of its disc (no unit): above 1 no disc holds zero, where the loop "
     "would be at its limit of stability."
@@ -152,6 +156,11 @@ def say_difference(each: Difference) -> str:
         case "mode":
             pole = "" if each.size is None else f", its pole at {format_number(each.value / each.size, 3)} Hz"
             return f"there is a mode at {format_number(each.value, 3)} Hz{pole}"
+        case "rate":
+            return (
+                f"the law is stepped at {format_number(each.value)} Hz by what the machine does, "
+                f"{format_number(each.size, 3)} times the rate of the log's clock; check the timer that calls it"
+            )
         case "gain":
             turned = "the sign of the drive is turned; " if each.value < 0.0 else ""
             return f"{turned}the force per command is {format_number(each.value, 3)} times the certified one{also}"
@@ -272,6 +281,8 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
         "Nothing is said between the lines and beyond them.",
         STABILITY,
     ]
+    if response.rate != 1.0:
+        remarks.append(RATE.format(format_number(response.rate, 3)))
     if show_stuck_bandwidth(result.controller):
         both = say_bandwidths(result.controller, result.controller.achieved.bandwidth_hz)
         remarks.append(f"Predicted is the actuator as it slides; its bandwidth is {both}.")

@@ -22,17 +22,19 @@ LINES = np.unique(np.round(np.geomspace(1, 150, 40)).astype(int))
 REFERENCE = multisine(1000, LINES, 10, 60.0, 3, bias=300.0)
 
 
-def respond(machine, f, controller, delay):
-    """Return L and Y/R of the simulator's equations: sampled exactly by python's own matrix exponential."""
+def respond(machine, f, controller, delay, period=1e-3):
+    """Return L and Y/R of the simulator's equations: sampled exactly by python's own matrix exponential; `period`: of
+    the ticks, in which the law's numbers are the same.
+    """
     a = np.array([[0.0, 1.0], [-machine.stiffness / machine.mass, -machine.damping / machine.mass]])
     b = np.array([0.0, machine.per_ampere * controller.per_effort / machine.mass])
     whole = np.zeros((3, 3))
     whole[:2, :2], whole[:2, 2] = a, b
-    moved = scipy.linalg.expm(whole * 1e-3)
-    z = np.exp(2j * np.pi * f * 1e-3)
+    moved = scipy.linalg.expm(whole * period)
+    z = np.exp(2j * np.pi * f * period)
     plant = np.array([machine.stiffness * np.linalg.solve(x * np.eye(2) - moved[:2, :2], moved[:2, 2])[0] for x in z])
     plant = plant * z**-delay
-    forward, feedback = controller.law.responses(f)
+    forward, feedback = controller.law.responses(f * period / 1e-3)
     return -feedback * plant, forward * plant / (1.0 - feedback * plant)
 
 
@@ -65,6 +67,41 @@ def test_margins_are_those_of_the_equations(controller, bench):
     for name, value in truth.items():
         assert rows[name].low < value < rows[name].high and np.isclose(rows[name].value, value, rtol=0.1), name
         assert np.isclose(rows[name].predicted, value, rtol=0.05)
+
+
+def run_at(bench, machine, rate):
+    """Return the log of a machine whose law is stepped at another rate, with the time that its firmware believes."""
+    run = bench.log(machine, REFERENCE, noise=0.5, period=1e-3 / rate)
+    signals = {name: run[name] for name in ("reference", "I", "F1")}
+    return so.Log.from_arrays(time=1e-3 * np.arange(len(run)), **signals)
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0])
+def test_a_law_at_another_rate_is_named_by_its_response_where_the_clock_of_the_log_counts_ticks(
+    compiler, tmp_path, controller, rate
+):
+    controller = so.tune(*controller.design, replace(controller.spec, bandwidth_hz=15))
+    bench = Bench(compiler, tmp_path, controller)
+    machine = replace(Machine(), damping=1.1 * Machine().damping)
+    log = run_at(bench, machine, rate)
+    ranges = {"eta": (0.95, 1.05), "b_r": (1.0e-4, 1.6e-4)}
+    result = so.accept(controller, [log], uncertainty=so.plants.thor(), ranges=ranges)
+    first = result.differences.found[0]
+    assert result.replayed and not result.met and not result.experiments
+    assert (first.kind, first.value) == ("rate", 1e3 * rate) and f"stepped at {1e3 * rate:g} Hz" in str(result)
+
+    import control
+
+    rows = {row.name: row for row in result.response.judged}
+    f = np.geomspace(0.5, 200.0, 4000)
+    loop, tracking = respond(machine, f, controller, 1, 1e-3 / rate)
+    phase, *_, crossing = control.stability_margins(control.frd(loop, 2.0 * np.pi * f))[1:5]
+    down = f[np.flatnonzero(np.abs(tracking) < np.sqrt(0.5))[0]]
+    (part,) = result.response.measured
+    at_lines = respond(machine, part.f, controller, 1, 1e-3 / rate)[0]
+    assert rows["Ms"].low < np.max(1.0 / np.abs(1.0 + at_lines)) < rows["Ms"].high
+    assert np.isclose(rows["bandwidth"].value, down, rtol=0.1)
+    assert np.isclose(rows["delay margin"].value, 1e3 * np.radians(phase) / crossing, rtol=0.15)
 
 
 def test_the_right_machine_is_accepted(controller, bench):

@@ -36,6 +36,7 @@ class Comparison:
     measured: Sequence[Measured]
     logs: Sequence[Ticks]
     names: tuple[str, ...]  # of the outputs
+    rate: float = 1.0  # at which the model's law is stepped, over what the clock of the logs says
 
     @property
     def plant(self) -> Plant:
@@ -76,17 +77,18 @@ class Comparison:
         """Return the responses of the model with each of some values."""
         if has_dry_friction(self.controller) and sets:
             return self._simulate(sets)
-        return [self._linearise(values) for values in sets]
+        return [self.linearise(values) for values in sets]
 
-    def _linearise(self, values: ParameterSet) -> Lines:
+    def linearise(self, values: ParameterSet) -> Lines:
+        """Return the response of the model, linear as it slides."""
         law, seen = self.controller, self.controller.see(take_sliding(self.plant, values))
-        timing = law.sample_time_s, law.compute_delay_samples
+        timing = law.sample_time_s / self.rate, law.compute_delay_samples
         sampled = sample(seen, law.delay(values), self.names, law.per_effort, *timing)
-        return np.concatenate([sampled.responses(part.f).ravel() for part in self.measured])
+        return np.concatenate([sampled.responses(self.rate * part.f).ravel() for part in self.measured])
 
     def _simulate(self, sets: Sequence[ParameterSet]) -> list[Lines]:
         """Return the responses of the law on the nonlinear plant, under the logged references."""
-        runs = [run_design(self.controller, sets, ticks.reference) for ticks in self.logs]
+        runs = [run_design(self.controller, sets, ticks.reference, rate=self.rate) for ticks in self.logs]
         return [self._cut([run.outputs for run in runs], k) for k in range(len(sets))]
 
     def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> Lines:

@@ -43,6 +43,10 @@ MODE_DAMPINGS = (0.02, 0.1)
 SEEN = 5.0  # std by which a line differs where a mode is looked for
 MODE_COST = 2.0  # by which a mode, of several sizes, has to leave less than another cause does
 LEAST_DAMPING, MOST_DAMPED = math.log(1e-4), 0.3
+RATES = np.geomspace(0.1, 10.0, 61)  # over that of the clock, at which the law is tried to be stepped
+USUAL_RATES = (0.5, 2.0, 0.1, 0.2, 0.25, 1.0 / 3.0, 3.0, 4.0, 5.0, 10.0)  # the first two are tried always
+SAME_RATE = 0.01  # relative: a rate that is a usual one
+RATE_COST = 2.0  # by which a usual rate may leave more than another cause does, and any other has to leave less
 MOST = 4  # causes that are listed
 
 Slopes = Complex[np.ndarray, "n m"]
@@ -52,16 +56,16 @@ Slopes = Complex[np.ndarray, "n m"]
 class Difference:
     """A way in which the machine differs, its size, and how much of the difference it explains."""
 
-    kind: str  # parameter, gain, delay, mode, range
+    kind: str  # parameter, gain, delay, mode, range, rate
     name: str  # the parameter, the signal
-    value: float  # factor of a parameter or gain; seconds; Hz; the range
+    value: float  # factor of a parameter or gain; seconds; Hz of a mode, of the law's ticks; the range
     low: float | None
     high: float | None
     unit: str
     explains: float  # share of the misfit, of what no certified machine has
     alike: tuple[str, ...] = ()  # parameters that would explain as much
     alike_values: tuple[float, ...] = ()  # their factors
-    size: float | None = None  # of a mode: its zero's frequency over its pole's
+    size: float | None = None  # of a mode: its zero's frequency over its pole's; of a rate: over that of the log
 
 
 @record(eq=False)
@@ -83,6 +87,13 @@ class _Tried:
         untold = abs(self.left - other.left) <= UNTOLD * max(other.left / noise, 1.0)
         return untold or bool(np.max(np.abs(self.response / other.response - 1.0)) <= TOLERATED)
 
+    @property
+    def rank(self) -> float:
+        """What it leaves, times what its kind costs."""
+        if self.difference.kind == "rate":
+            return self.left * (1.0 / RATE_COST if self.difference.size in USUAL_RATES else RATE_COST)
+        return self.left * (MODE_COST if self.difference.kind == "mode" else 1.0)
+
 
 def explain(comparison: Comparison, beside: Comparison, model: Lines, spread: Spread) -> list[Difference]:
     """Return the causes that explain the misfit of a controller's design plant, the best first. `beside`: of what was
@@ -99,8 +110,8 @@ def explain(comparison: Comparison, beside: Comparison, model: Lines, spread: Sp
         spread, slopes = take_spread((), {}), slopes[:0]
         fit, before = replace(fit, leeway=spread.leave(slopes)), comparison.misfit(model)
     tried = [*_try_parameters(comparison, values, model, spread, slopes), *_try_shapes(fit, model)]
-    tried = [each for each in tried if each.left < before]
-    tried.sort(key=lambda each: each.left * (MODE_COST if each.difference.kind == "mode" else 1.0))
+    tried = [each for each in (*tried, *_try_rate(comparison, values, spread)) if each.left < before]
+    tried.sort(key=lambda each: each.rank)
     kinds: list[list[_Tried]] = []
     for each in tried:
         twins = next((kind for kind in kinds if each.is_like(kind[0], noise)), None)
@@ -244,6 +255,43 @@ def _step(comparison: Comparison, spread: Spread, values: ParameterSet, factors:
         log = float(np.clip(each.log + best.sizes[0], -MOST_LOG, MOST_LOG))
         changed.append(replace(each, log=log, best=best))
     return changed
+
+
+def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> Iterator[_Tried]:
+    """Yield the rate of the law's ticks that fits best. Law and log both go by ticks, so that the replay of a log whose
+    clock counts them does not tell it; the machine goes by seconds, and its response does.
+    """
+
+    def at(log: float) -> Comparison:
+        return replace(comparison, rate=math.exp(log))
+
+    def misfit(log: float) -> float:
+        left = comparison.misfit(at(log).predict([values])[0])
+        return left if math.isfinite(left) else math.inf  # of a loop that runs away at that rate
+
+    sliding = [comparison.misfit(replace(comparison, rate=rate).linearise(values)) for rate in RATES]
+    log = min(map(math.log, (*USUAL_RATES[:2], float(RATES[int(np.nanargmin(sliding))]))), key=misfit)
+    best: _Best | None = None
+    for _ in range(ROUNDS):
+        (model,), (after,) = at(log).predict([values]), at(log + STEP).predict([values])
+        slope = (after - model) / STEP
+        if not np.all(np.isfinite(slope)):
+            return
+        leeway = spread.leave(_find_slopes(at(log), spread, values, model))
+        fit = _Fit(comparison=comparison, leeway=leeway)
+        best = fit.solve(lambda x, model=model, slope=slope: model + x[0] * slope, [0.0], MOST_STEP)
+        log += float(best.sizes[0])
+        if abs(best.sizes[0]) <= FOUND:
+            break
+    assert best is not None
+    far, rate = 1.96 * best.std, math.exp(log)
+    rate = next((each for each in USUAL_RATES if abs(rate / each - 1.0) <= SAME_RATE), rate)
+    value = rate / comparison.controller.sample_time_s
+    low, high = (value * math.exp(-far), value * math.exp(far)) if far < MOST_SPREAD else (None, None)
+    difference = Difference(
+        kind="rate", name="law", value=value, low=low, high=high, unit="Hz", explains=0.0, size=rate
+    )  # fmt: skip
+    yield _Tried(difference=difference, left=best.left, response=best.response)
 
 
 def _try_shapes(fit: _Fit, model: Lines) -> Iterator[_Tried]:

@@ -63,6 +63,7 @@ class Response:
     at_amplitude_only: bool  # dry friction, and the gain is another one at another amplitude, or was seen at one only
     needs_phases: bool  # dry friction, and fewer than six sets of phases
     needs_lines: tuple[float, float] | None = None  # Hz, from where to where lines are to lie, where they do not
+    rate: float = 1.0  # of the law, over what the clock of the logs says: Hz and seconds are those of the machine
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
@@ -73,6 +74,7 @@ class Response:
             "at_amplitude_only": self.at_amplitude_only,
             "needs_phases": self.needs_phases,
             "needs_lines_hz": self.needs_lines,
+            "rate": self.rate,
             "measured": [_describe_lines(part, 1.0 - self.confidence) for part in self.measured],
         }
 
@@ -126,12 +128,15 @@ def has_dry_friction(controller: Controller) -> bool:
     return any(find_dry_friction(plant, plant.complete(values)).values())
 
 
-def judge_response(controller: Controller, groups: Sequence[Blocks], confidence: float) -> Response:
-    """Return the response of periods, a group per amplitude, and what it says of the controller's limits."""
+def judge_response(controller: Controller, groups: Sequence[Blocks], confidence: float, rate: float = 1.0) -> Response:
+    """Return the response of periods, a group per amplitude, and what it says of the controller's limits. `rate`: at
+    which the law was stepped, over what the clock of the logs says.
+    """
     dry = has_dry_friction(controller)
     by_phases = dry or all(group.realisations >= LEAST_PHASES for group in groups)
     by_phases = by_phases and all(group.realisations >= 2 for group in groups)
-    measured = tuple(measure(controller, group, by_phases) for group in groups)
+    parts = [measure(controller, group, by_phases) for group in groups]  # the law goes by ticks, whatever they last
+    measured = tuple(replace(part, f=rate * part.f) for part in parts)
     needs_phases = dry and any(part.phases < LEAST_PHASES for part in measured)
     alpha = 1.0 - confidence
     rows = [
@@ -147,7 +152,7 @@ def judge_response(controller: Controller, groups: Sequence[Blocks], confidence:
     if needs_lines:  # a line that breaks a limit does so whatever lies beside it; turns are counted from line to line
         open_ = [row.outcome == "confirmed" or row.name == "stability" for row in rows]
         rows = [_leave_open(row) if each else row for row, each in zip(rows, open_, strict=True)]
-    longest_s = max(group.period_s for group in groups)
+    longest_s = max(group.period_s for group in groups) / rate
     rows = [_tell_near(row, longest_s) for row in rows]
     limited = [row for row in rows if row.limit is not None]
     return Response(
@@ -158,6 +163,7 @@ def judge_response(controller: Controller, groups: Sequence[Blocks], confidence:
         at_amplitude_only=dry and not _is_same_gain(measured),
         needs_phases=needs_phases,
         needs_lines=needs_lines,
+        rate=rate,
     )
 
 
