@@ -261,7 +261,9 @@ def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment)
         state = plant.followed[name].state
         signal = replace(log.signals[state], name=name, values=experiment.read(state))
         log = replace(log, signals={**log.signals, name: signal})
-    number, longest = max(enumerate(log.segments), key=lambda pair: pair[1].stop - pair[1].start)  # no gap is crossed
+    number, longest = max(
+        enumerate(experiment.log_segments), key=lambda pair: pair[1].stop - pair[1].start
+    )  # no gap is crossed
     log = log.between(*(log.time[[longest.start, longest.stop - 1]] - log.time[0]))
     params = plant.complete(experiment.apply_own(fit.parameters))
     run = simulate(plant, params, log, rtol=SIMULATED)
@@ -278,7 +280,7 @@ def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment)
     current, speed, deflection = np.array(read(states, inputs, params.vector))
     ripple: Mapping[str, float] = {}
     position, left = plant.sensing and plant.sensing.motor_position, residuals[experiment.name]
-    if position and position in plant.states and len(left.segments) == len(experiment.log.segments):
+    if position and position in plant.states and len(left.segments) == len(experiment.log_segments):
         minimum = fit.require_minimum("_measure")
         posed = next(e for e in minimum.problem.experiments if e.name == experiment.name)
         read = experiment.reads(position)

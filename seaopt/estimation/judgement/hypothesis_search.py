@@ -274,7 +274,8 @@ def _refit(
     """
     before = count_evaluations()
     problem = _pose(change, old)
-    problem, start = _choose_start(change, problem, old.unknowns.by_name(fitted.z))
+    begins = _begin_segments(problem, old, fitted.z)
+    problem, start = _choose_start(change, problem, {**begins, **old.unknowns.by_name(fitted.z)})
     refit = _descend(change, _rest(problem, start, old), start, fitted, base, helps, end)
     return refit and replace(refit, evaluations=count_evaluations() - before)
 
@@ -395,15 +396,38 @@ def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float])
     return min(starts, key=reach)
 
 
+def _begin_segments(problem: FitProblem, old: FitProblem, z: Vector) -> dict[str, float]:
+    """Return the states in which a fit's own run passes the beginnings of segments that the fit did not have: where a
+    position is lost that only the changed plant follows.
+    """
+    begins, names = dict[str, float](), problem.unknowns.names
+    for new, before in zip(problem.experiments, old.experiments, strict=True):
+        if len(new.segments) == len(before.segments):
+            continue
+        passed = np.zeros((len(before.data.log), before.model.nx))
+        for segment, rows in zip(before.segments, before.data.segment_rows, strict=True):
+            passed[rows] = before.run(segment, z, sums=False, states=True).states
+        for segment, rows in zip(new.segments, new.data.segment_rows, strict=True):
+            at = dict(zip(before.data.plant.states, passed[rows.start].tolist(), strict=True))
+            slots = zip(new.data.plant.states, segment.initial, strict=True)
+            begins |= {names[slot.index]: at[state] for state, slot in slots if slot.index is not None and state in at}
+    return begins
+
+
 def _rest(problem: FitProblem, start: Evaluation, old: FitProblem) -> FitProblem:
     """Return a problem whose joints start as the fit has them, at rest: no slope tells with which speed, or with which
-    state of what is added. `old`: the problem of the fit.
+    state of what is added. A segment that the fit did not have starts anywhere. `old`: the problem of the fit.
     """
     places, unknowns = problem.find_stopped(), problem.unknowns
     if not places or np.any(start.z[places] != 0.0):
         return problem
     before = dict(zip(old.unknowns.names, old.unknowns.low == old.unknowns.high, strict=True))
-    places += [i for i, name in enumerate(unknowns.names) if i >= unknowns.shared and before.get(name, True)]
+    groups = {name.rpartition(".")[0] for name in before}
+    places += [
+        i
+        for i, name in enumerate(unknowns.names)
+        if i >= unknowns.shared and before.get(name, name.rpartition(".")[0] in groups)
+    ]
     return replace(problem, unknowns=unknowns.bound(places, start.z[places], start.z[places]))
 
 

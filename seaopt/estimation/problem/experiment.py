@@ -9,14 +9,15 @@ from itertools import combinations, pairwise
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from seaopt.errors import EstimationError, require_number, require_type, suggestion
 from seaopt.estimation.problem.shapes import Signal
-from seaopt.formatting import format_count
+from seaopt.formatting import format_count, join_words
 from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
 from seaopt.logs.quality.channel import BEYOND
+from seaopt.logs.quality.clock import split_rows
 from seaopt.logs.quality.faults import find_quantisation, find_runs
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -31,7 +32,7 @@ EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
-BRIDGED = 4  # missing samples in a row, that a line stands in for without a word
+BRIDGED = 4  # missing samples in a row, that a line stands in for
 FEWEST_READ = 16  # samples that tell a reading's noise
 ROUGH = 0.3  # rad of a wave, that takes 4 % of it
 Mask = Literal["auto", "declared", "none"]
@@ -155,6 +156,7 @@ class Experiment:
         self._check_parameters()
         self._check_settings()
         self._mask()
+        self._split_at_lost()
         self._check_sizes()
 
     def _refuse(self, text: str) -> EstimationError:
@@ -184,33 +186,28 @@ class Experiment:
         if not plant.followed:
             return plant
         values = plant.complete(self.apply_own(params))
-        fine = all(values[each.wave].value <= self.find_finest(each.state) for each in plant.followed.values())
+        fine = all(
+            values[each.wave].value <= self.find_finest(each.state) and self._is_whole(each.state)
+            for each in plant.followed.values()
+        )
         return follow_readings(plant) if fine else plant
 
     def describe_readings(self, params: ParameterSet) -> list[str]:
-        """Return what a fit makes of the readings that its plant can follow, one sentence each: which are too coarse,
-        and where a line stands in for one.
+        """Return what a fit makes of the readings that its plant can follow, one sentence each: those too coarse,
+        or with too few samples in a row.
         """
         plant, sentences = self.plant, list[str]()
-        values, follows = plant.complete(self.apply_own(params)), bool(self.follow(params).read_inputs)
+        values = plant.complete(self.apply_own(params))
         for each in plant.followed.values():
             finest, wave = self.find_finest(each.state), values[each.wave].value
-            longest = self._count_longest_gap(each.state) if finest else 0
-            if 0.0 < finest < wave:
+            if finest and not self._is_whole(each.state):
+                sentences.append(f"{each.state}: too few samples in a row are there: the position is the model's own")
+            elif 0.0 < finest < wave:
                 sentences.append(
                     f"{each.state}: noise and steps are {ROUGH * wave / finest:.2g} rad of a wave of {each.wave} = "
                     f"{wave:.4g}, above {ROUGH:g}: the position is the model's own there"
                 )
-            elif follows and longest > BRIDGED:
-                sentences.append(
-                    f"{each.state}: up to {longest} samples in a row are missing, and the position is a line there: "
-                    "the force that repeats with it is wrong; choose a stretch without (slice_s)"
-                )
         return sentences
-
-    def _count_longest_gap(self, output: str) -> int:
-        """Return how many samples in a row are missing of an output, at most."""
-        return int(np.max(find_runs(~np.isfinite(self.log[output])).lengths, initial=0))
 
     def reads(self, state: str) -> bool:
         """Tell whether one of the measured outputs is a state, with enough samples to tell its noise."""
@@ -363,6 +360,35 @@ class Experiment:
                 raise self._refuse(f"every sample of {name} is saturated; correct saturation, or leave it out")
         object.__setattr__(self, "log", log)
 
+    def _split_at_lost(self) -> None:
+        """Leave out of the segments where a reading that the plant can follow is missing for longer than a line
+        bridges: where it has moved by then, and in what state the plant is after it, nothing tells.
+        """
+        lost = np.zeros(len(self.log), dtype=bool)
+        for each in self.plant.followed.values():
+            lost |= self._find_lost(each.state) if self.reads(each.state) else False
+        kept = [
+            slice(whole.start + rows.start, whole.start + rows.stop)
+            for whole in self.log_segments
+            for rows in split_rows(np.flatnonzero(np.diff(lost[whole])) + 1, whole.stop - whole.start, FEWEST_READ)
+            if not lost[whole.start + rows.start]
+        ]
+        if np.any(lost) and kept:
+            object.__setattr__(self, "log_segments", tuple(kept))
+
+    def _find_lost(self, output: str) -> Bool[np.ndarray, " n"]:
+        """Return the samples at which an output is missing, more of them in a row than a line bridges."""
+        lost = ~np.isfinite(self.log[output])
+        runs = find_runs(lost)
+        for first, last in zip(runs.start.tolist(), runs.stop.tolist(), strict=True):
+            lost[first:last] = last - first > BRIDGED
+        return lost
+
+    def _is_whole(self, state: str) -> bool:
+        """Tell whether a reading is nowhere lost in the segments."""
+        lost = self._find_lost(state) if self.reads(state) else np.ones(len(self.log), dtype=bool)
+        return not any(np.any(lost[rows]) for rows in self.log_segments)
+
     def _check_sizes(self) -> None:
         """Refuse samples that no sensor gives and no declared range masks: one of them is all that a fit would see."""
         for name in {*self.outputs, *self.plant.inputs} & set(self.log.signals):
@@ -385,13 +411,20 @@ class Experiment:
     @property
     def notes(self) -> tuple[str, ...]:
         """How the log was changed, and which of its samples have no weight, one sentence each."""
-        log, segments = self.log, self.log_segments
+        log, segments = self.log, tuple(self.log.segments)
         notes = list(log.notes)
         if segments != (slice(0, len(log)),):
             alone = len(log) - sum(rows.stop - rows.start for rows in segments)
             notes.append(
                 f"{format_count(len(log.gaps), 'gap')} split the log into {format_count(len(segments), 'segment')}"
                 + (f", {format_count(alone, 'sample')} alone between gaps left out" if alone else "")
+            )
+        if self.log_segments != segments:
+            followed = join_words(sorted({each.state for each in self.plant.followed.values()} & {*self.outputs}))
+            count = sum(rows.stop - rows.start for rows in self.log_segments)
+            notes.append(
+                f"{followed}: more than {BRIDGED} samples in a row are missing, so that the log is left out there: "
+                f"{count} of {len(log)} samples are used, in {format_count(len(self.log_segments), 'segment')}"
             )
         for name in self.outputs:
             missing = int(np.count_nonzero(~np.isfinite(log[name])))

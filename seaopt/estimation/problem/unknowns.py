@@ -239,7 +239,7 @@ def _add_initial(
     """
     plant, initial = experiment.plant, experiment.initial_state
     initial_values = fill_vector("state", plant.states, dict(initial) if isinstance(initial, Mapping) else None)
-    starts = {rows.start for rows in experiment.log_segments}
+    starts = {rows.start for rows in experiment.log.segments}
     stopped = _scale_stopped_speeds(builder, experiment, model)
     initial_slots: list[tuple[Slot, ...]] = []
     for number, rows in enumerate(experiment.segment_rows):

@@ -132,11 +132,34 @@ def test_a_coarse_reading_is_not_followed(step, follows):
     assert follows or rounded < float(re.search(r"are (.*?) rad", said[0])[1]) < 2.0 * rounded
 
 
-@pytest.mark.parametrize(("missing", "says"), [(0, False), (3, False), (400, True)])
-def test_a_line_in_place_of_a_position_is_told(missing, says):
+@pytest.mark.parametrize(("missing", "splits"), [(0, False), (3, False), (400, True)])
+def test_where_the_position_is_lost_the_log_is_left_out(missing, splits):
+    """What follows starts from a state of its own, though the log starts at rest."""
     experiment, params = pose(_hide(record(), "theta_m", slice(1000, 1000 + missing)), parts=("cogging",), **COGS)
-    said = experiment.describe_readings(params)
-    assert [f"up to {missing} samples" in text for text in said] == [True] * says
+    n = len(experiment.log)
+    assert experiment.log_segments == ((slice(0, 1000), slice(1400, n)) if splits else (slice(0, n),))
+    assert any(f"{n - 400} of {n} samples are used" in note for note in experiment.notes) is splits
+    fit = so.fit([experiment], params.free("a_g"))
+    assert fit.parameters["a_g"].value == pytest.approx(COGS["a_g"], rel=0.03)
+    assert all(figures.excess < 1.3 for figures in fit.outputs["experiment"].values())
+    assert not fit.hypotheses
+
+
+def test_cogging_is_found_where_the_position_is_lost_for_a_while():
+    """The plain plant's fit had no segment there: the state that it passes is where that of the other begins."""
+    experiment, params = pose(_hide(record(), "theta_m", slice(1000, 1400)))
+    best = so.fit([experiment], params).hypotheses[0]
+    assert (best.parts, best.outcome) == (("cogging",), "adopted")
+    assert best.frees["n_g"] == pytest.approx(COGS["n_g"], rel=1e-4)
+    for name in ("J_m", "b_r", "f_c", "k_s"):
+        assert best.parameters[name] == pytest.approx(TRUTH[name], rel=1e-3), name
+
+
+def test_a_position_with_few_samples_in_a_row_is_not_followed():
+    experiment, params = pose(_hide(record(), "theta_m", np.arange(3200) % 6 > 0), parts=("cogging",), **COGS)
+    assert experiment.log_segments == (slice(0, len(experiment.log)),)
+    assert not experiment.follow(params).read_inputs
+    assert "too few samples in a row" in experiment.describe_readings(params)[0]
 
 
 def test_a_held_actuator_is_fitted_from_values_and_a_delay_that_are_off():
