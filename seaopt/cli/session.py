@@ -19,7 +19,7 @@ from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_sources
 from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
-from seaopt.control.frontier.frontier import FRONTIER_SCHEMA
+from seaopt.control.frontier.rows import FRONTIER_SCHEMA
 from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, warn_delays
 from seaopt.control.laws.stored import CONTROLLER_SCHEMA
 from seaopt.control.laws.structures import CUSTOM
@@ -36,6 +36,7 @@ from seaopt.logs import Log, write_log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, Stages, read_problem
+from seaopt.problem.completion import find_outer
 from seaopt.problem.explained import adopt, find_explanation, say_adopted, say_unexplained
 from seaopt.problem.problem import WRITE_ONE
 from seaopt.problem.stages import (
@@ -423,8 +424,6 @@ class Session:
             raise ProblemError(
                 f'{file}: a sweep tunes gains, and [controller] has structure = "mpc"; write structure = "pid" to sweep'
             )
-        if self.problem.schedule is not None:
-            raise ProblemError(f"{file}: a sweep is of one law; take [controller.schedule] out")
         design = self.problem.design_plant
         self.warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
         design, robust_to = list_plants(self.problem, source)
@@ -433,12 +432,16 @@ class Session:
                 f"{file}: --free-law takes a model, and [controller] is designed on {self.problem.response_names[0]}; "
                 "leave --free-law out, or name a plant there"
             )
+        schedule = self.problem.schedule
         result = sweep(
             design,
             self.values(),
             self._spec(),
             self.bandwidths_hz,
             robust_to,
+            over=None if schedule is None else schedule.over,
+            points=() if schedule is None else schedule.points,
+            outer=find_outer(self.problem, source),
             draws=self.problem.draws(source),
             free_law=self.free_law,
             executor=self.executor,

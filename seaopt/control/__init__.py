@@ -4,7 +4,8 @@ from seaopt.control.compensation.compensate import add_compensation
 from seaopt.control.compensation.ripple_fit import RippleFit, identify_ripple
 from seaopt.control.deploy.export import export
 from seaopt.control.frontier.free_law import FreeLaw, bound_free_law
-from seaopt.control.frontier.frontier import Frontier, sweep
+from seaopt.control.frontier.frontier import sweep
+from seaopt.control.frontier.rows import Frontier
 from seaopt.control.given.assessment import assess
 from seaopt.control.given.law_file import GivenLaw, read_law
 from seaopt.control.given.pid_forms import cascade_pid, drive_pid, ideal_pid, parallel_pid

@@ -46,15 +46,13 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
 
 def find_outer(problem: Problem, source: Fit | ParameterSet) -> Callable[[Any], OuterLoop | None] | None:
     """Return what says with which outer loop a tuned law, or a schedule, is to run; None where the file has none."""
-    if problem.table.impedance is None:
-        return None
+    return None if problem.table.impedance is None else partial(_surround, problem, source)
 
-    def surround(law: Controller | ScheduledController) -> OuterLoop | None:
-        if isinstance(law, ScheduledController):
-            return _surround_schedule(problem, law, source)[0].outer
-        return add_outer_loop(problem, [(law, problem.values(source))])[0].outer
 
-    return surround
+def _surround(problem: Problem, source: Fit | ParameterSet, law: Controller | ScheduledController) -> OuterLoop | None:
+    if isinstance(law, ScheduledController):
+        return _surround_schedule(problem, law, source)[0].outer
+    return add_outer_loop(problem, [(law, problem.values(source))])[0].outer
 
 
 def add_outer_loop(

@@ -2,104 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from seaopt.control.frontier.free_law import FreeLaw, bound_free_law
+from seaopt.control.frontier.rows import Frontier, FrontierRow, SlidingAlone, make_row, measure_disturbance
+from seaopt.control.frontier.scheduled import ScheduleSweep, slide_plants, sweep_schedule
+from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
-from seaopt.control.laws.delay import settle_delays
+from seaopt.control.laws.delay import settle_delays, take_own_delays
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import judge_all, list_broken
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.tuning.found_law import FoundLaw, Surround, meet_outer
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import feed_link, lower_fraction, search, solve
-from seaopt.control.tuning.tuner import Draws, RobustTo, aim_task, disturbance, make_controller, make_task, name_design
+from seaopt.control.tuning.tuner import Draws, RobustTo, aim_task, make_controller, make_task, name_design
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.executors import Shared, check_executor, map_ordered
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import take_sliding
 from seaopt.progress import Progress, divide, ignore, prefix
-from seaopt.records import PlotAccessor, Result, Worded, record
-from seaopt.units import LINEAR, Mechanics
+from seaopt.records import record
 
-FRONTIER_SCHEMA = "seaopt/frontier/1"
 MOST_ROWS = 1000
 CHAIN = 4  # bandwidths of which each starts from the one before: chains are independent, whatever works on them
-
-
-@record
-class SlidingAlone(Result):
-    """The best law for the sliding plants alone: whether limits are met, noise gain and disturbance, as in a row."""
-
-    met: bool
-    noise_gain: float
-    disturbance: float
-
-
-@record
-class FrontierRow(Result):
-    """One bandwidth; what is not said to be of the worst plant is of the design plant."""
-
-    bandwidth_hz: float
-    met: bool  # whether every limit is met; if not, the figures are those of the controller that misses them least
-    noise_gain: float  # N/N
-    ms: float  # ms, ms_plant: largest Ms of all plants, and whose it is
-    ms_plant: str
-    disturbance: float  # integral over ln f of abs(S) from 0.1 Hz to the bandwidth, worst plant
-    sensitivity_bandwidth_hz: float  # abs(S) stays below -3 dB up to here
-    phase_margin_deg: float | None  # phase_margin_deg, disk_margin: as in `LoopFigures`
-    disk_margin: float
-    # largest amplitude of the reference at the bandwidth before the current saturates; None without a limit
-    force_limit_N: float | None
-    blocked_by: tuple[str, ...]  # the limits that are broken
-    # what could be had if no plant ever stuck; None where none has friction. The difference is what friction costs
-    without_sticking: SlidingAlone | None = None
-    # the best that any linear law could do on the design plant; None where it was not asked for. The difference to the
-    # disturbance, or with that objective to the noise gain, is what the structure costs, at most
-    free_law: FreeLaw | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the row of frontier.json."""
-        fields, alone = asdict(self) | {"feasible": self.met}, self.without_sticking
-        return fields if alone is None else fields | {"without_sticking": asdict(alone) | {"feasible": alone.met}}
-
-
-@record(eq=False, repr=False)
-class Frontier(Result, Worded):
-    """The rows of a sweep, and their controllers."""
-
-    plot = PlotAccessor()
-
-    rows: tuple[FrontierRow, ...]
-    controllers: tuple[Controller, ...]
-
-    @property
-    def met(self) -> bool:
-        """Whether every limit is met at some bandwidth."""
-        return any(row.met for row in self.rows)
-
-    @property
-    def mechanics(self) -> Mechanics:
-        """Units and words of what the controllers command."""
-        return self.controllers[0].command.mechanics if self.controllers else LINEAR
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of frontier.json (schema seaopt/frontier/1)."""
-        return {
-            "schema": FRONTIER_SCHEMA,
-            "met": self.met,
-            "rows": [row.to_dict() for row in self.rows],
-            "controllers": [controller.to_dict() for controller in self.controllers],
-        }
 
 
 def sweep(
@@ -109,7 +45,10 @@ def sweep(
     bandwidths_hz: Sequence[float],
     robust_to: RobustTo | None = None,
     *,
+    over: str | None = None,
+    points: Sequence[float] = (),
     draws: Draws = (),
+    outer: Callable[[Any], OuterLoop | None] | None = None,
     free_law: bool = False,
     executor: Executor | None = None,
     progress: Progress = ignore,
@@ -120,16 +59,19 @@ def sweep(
 
     Parameters
     ----------
-    plant, params, spec, robust_to, draws
+    plant, params, spec, robust_to, draws, outer
         As `tune`; the specification's own bandwidth is not used.
     bandwidths_hz : sequence of float
         In the specification's range.
+    over, points : str and sequence of float, optional
+        Of a schedule, as in `seaopt.control.tune_schedule`, which is tuned at every bandwidth by itself.
     free_law : bool
         Also compute, for each bandwidth, the best that any linear law could do on the design plant under these limits
-        (`seaopt.control.bound_free_law`), which takes about two seconds; not where the design plant is measured.
+        (`seaopt.control.bound_free_law`), which takes about two seconds; of a schedule at each point, and that of the
+        point with the largest objective is stated. Not where the design plant is measured.
     executor : concurrent.futures.Executor, optional
-        Where bandwidths are tuned, four by four (`seaopt.executors`); here, if left out. The result is the same, bit
-        for bit.
+        Where bandwidths are tuned, four by four, schedules one by one (`seaopt.executors`); here, if left out. The
+        result is the same, bit for bit.
     progress : callable, optional
         Called with the bandwidth that is tuned and the share of all that is done (`seaopt.progress.Progress`).
 
@@ -159,22 +101,44 @@ def sweep(
         )
     if not 0 < len(bandwidths_hz) <= MOST_ROWS:
         raise ControlError(f"bandwidths_hz has {len(bandwidths_hz)} values; give 1 to {MOST_ROWS}")
+    robust_to = take_own_delays(spec, design, robust_to or {}, params)
     spec, params = settle_delays(spec, design, params)
     # What is wrong with any row is said before the first is tuned.
     specs = [replace(spec, bandwidth_hz=require_number(f, "bandwidths_hz", ControlError)) for f in bandwidths_hz]
-    robust_to = robust_to or {}
+    if over is not None:
+        if isinstance(plant, MeasuredResponse):
+            raise ControlError(
+                f"over = {over}: a measured response stands at one value, and a schedule takes a model as its design "
+                "plant; name the response in robust_to"
+            )
+        schedules = ScheduleSweep(
+            plant=plant,
+            params=params,
+            over=over,
+            points=points,
+            robust_to=robust_to,
+            draws=draws,
+            outer=outer,
+            free_law=free_law,
+        )
+        found = sweep_schedule(schedules, specs, executor, progress)
+        progress(f"{spec.structure} over {over}, {len(found)} bandwidths", 1.0)
+        return Frontier(rows=tuple(row for row, _ in found), controllers=tuple(one for _, one in found), over=over)
+    sliding, others = slide_plants(plant, params, robust_to)
     swept = _Sweep(
         task=make_task(plant, params, specs[0], robust_to, draws),
-        sliding=_make_sliding_task(plant, params, specs[0], robust_to, draws),
+        sliding=make_task(sliding, params, specs[0], others, draws),
         design=(plant, params),
+        outer=outer,
         free_law=free_law,
     )
     rows: list[FrontierRow] = []
     controllers: list[Controller] = []
     for point, solved in zip(specs, _solve_chains(swept, specs, executor, progress), strict=True):
-        task = feed_link(replace(swept.task, spec=point), solved.link)
+        task = swept.surround(feed_link(replace(swept.task, spec=point), solved.link), solved.outer)
         controllers.append(make_controller(task, solved.x, solved.loops, swept.design))
-        rows.append(_make_row(task, solved, controllers[-1]))
+        compared: dict[str, Any] = {"without_sticking": solved.without_sticking, "free_law": solved.free_law}
+        rows.append(make_row(task, task.law_of(solved.x), solved.loops, controllers[-1], **compared))
     progress(f"{spec.structure}, {len(rows)} bandwidths", 1.0)
     return Frontier(rows=tuple(rows), controllers=tuple(controllers))
 
@@ -186,6 +150,7 @@ class _Sweep:
     task: Task
     sliding: Task
     design: tuple[Plant | MeasuredResponse, ParameterSet]
+    outer: Surround | None
     free_law: bool
 
     @property
@@ -193,14 +158,26 @@ class _Sweep:
         """Whether there is friction that a plant sticks with."""
         return len(self.sliding.plants) < len(self.task.plants)
 
+    def surround(self, task: Task, outer: OuterLoop | None) -> Task:
+        """Return a task with an outer loop, where there is one."""
+        if outer is None:
+            return task
+        command = command_of(name_design(self.design[0]), self.design[1], task.spec.regulated)
+        return task.enclosed(outer, command.per_effort)
+
+    def describe(self, found: FoundLaw) -> Controller:
+        """Return the controller of what was found."""
+        return make_controller(found.task, found.x, found.loops, self.design)
+
 
 @record(eq=False)
 class _Solved:
-    """The numbers of one bandwidth's law, its loops, its link's path, and what it is compared with."""
+    """The numbers of one bandwidth's law, its loops, its link's path, its outer loop, and what it is compared with."""
 
     x: LawNumbers
     loops: list[MeasuredLoop]
     link: LinkPath | None
+    outer: OuterLoop | None
     without_sticking: SlidingAlone | None
     free_law: FreeLaw | None
 
@@ -233,28 +210,17 @@ def _solve_chain(swept: _Sweep, chain: Sequence[ControllerSpec], progress: Progr
         task = aim_task(swept.task, point)
         task, x, loops = lower_fraction(task, *solve(task, warm, whole))
         x, loops = search(task, x, loops)
-        sliding = feed_link(replace(swept.sliding, spec=point), task.link)
+        if swept.outer is not None:
+            found = meet_outer(FoundLaw(task=task, x=x, loops=loops), swept.describe, swept.outer, ignore)
+            task, x, loops = found.task, found.x, found.loops
+        around = None if task.moved is None else task.moved.outer
+        sliding = swept.surround(feed_link(replace(swept.sliding, spec=point), task.link), around)
         alone = _tune_sliding(sliding, x, sliding_alone) if swept.sticks else None
         free = None
         if swept.free_law and isinstance(task.plants[0], DigitalPlant):
             free = bound_free_law(task.plants[0], point, [task.law_of(x).balanced()])
-        yield _Solved(x=x, loops=loops, link=task.link, without_sticking=alone, free_law=free)
+        yield _Solved(x=x, loops=loops, link=task.link, outer=around, without_sticking=alone, free_law=free)
         warm = (x,)
-
-
-def _make_sliding_task(
-    plant: Plant | MeasuredResponse, params: ParameterSet, spec: ControllerSpec, robust_to: RobustTo, draws: Draws
-) -> Task:
-    """Return the task on the sliding plants alone; measured ones are what they are."""
-    sliding: dict[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse] = {}
-    for name, other in robust_to.items():
-        if isinstance(other, MeasuredResponse):
-            sliding[name] = other
-            continue
-        model, values = other if isinstance(other, tuple) else (other, params)
-        sliding[name] = (take_sliding(model, model.complete(values)), values)
-    design = plant if isinstance(plant, MeasuredResponse) else take_sliding(plant, plant.complete(params))
-    return make_task(design, params, spec, sliding, draws)
 
 
 def _tune_sliding(task: Task, start: LawNumbers, progress: Progress) -> SlidingAlone:
@@ -262,29 +228,5 @@ def _tune_sliding(task: Task, start: LawNumbers, progress: Progress) -> SlidingA
     return SlidingAlone(
         met=not list_broken(judge_all(task.spec, loops)),
         noise_gain=loops[0].figures.noise_gain,
-        disturbance=_worst_disturbance(task, x),
-    )
-
-
-def _worst_disturbance(task: Task, x: LawNumbers) -> float:
-    return max(disturbance(task.loop(x, i), task.spec.bandwidth_hz) for i in range(len(task.plants)))
-
-
-def _make_row(task: Task, solved: _Solved, controller: Controller) -> FrontierRow:
-    design, f_b = solved.loops[0].figures, task.spec.bandwidth_hz
-    worst = max(solved.loops, key=lambda loop: loop.figures.ms)
-    return FrontierRow(
-        bandwidth_hz=f_b,
-        met=controller.met,
-        noise_gain=design.noise_gain,
-        ms=worst.figures.ms,
-        ms_plant=worst.name,
-        disturbance=_worst_disturbance(task, solved.x),
-        sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz,
-        phase_margin_deg=design.phase_margin_deg,
-        disk_margin=design.disk_margin,
-        force_limit_N=controller.force_limit(f_b),
-        blocked_by=controller.blocked_by,
-        without_sticking=solved.without_sticking,
-        free_law=solved.free_law,
+        disturbance=measure_disturbance(task, task.law_of(x)),
     )

@@ -26,8 +26,9 @@ from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.gain_table import GainTable
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, make_runnable
 from seaopt.control.scheduling.step_order import SHARE
+from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import feed_link
-from seaopt.control.tuning.tuner import describe_law, make_task
+from seaopt.control.tuning.tuner import Draws, RobustTo, describe_law, make_task
 from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import format_count, join_words
 from seaopt.parameters import ParameterSet
@@ -395,11 +396,8 @@ def _freeze(
 ) -> tuple[Controller, list[MeasuredLoop]]:
     """Return the controller of a table's gains at a value with its loops on the plants there."""
     plant, params = design[0], place_variable(*design, table.over, value)
-    task = make_task(plant, plant.complete(params), spec, place_plants(others, table.over, value))
+    task = make_place_task(table, value, spec, design, place_plants(others, table.over, value), outer)
     gains, law = table.find_gains(value), table.law(value)
-    task = feed_link(task, gains.link)
-    if outer is not None:
-        task = task.enclosed(outer, command_of(plant, params, spec.regulated).per_effort)
     loops = task.measure_law(
         law,
         filter_samples=gains.T_f / table.sample_time_s if gains.k_d else math.inf,
@@ -412,6 +410,22 @@ def _freeze(
         task = replace(task, spec=reached)
     made = describe_law(task, law, loops, (plant, params), gains=table.interpolate(value), observer=gains.observer)
     return made, loops
+
+
+def make_place_task(
+    table: GainTable,
+    value: float,
+    spec: ControllerSpec,
+    design: tuple[Plant, ParameterSet],
+    others: RobustTo,
+    outer: OuterLoop | None = None,
+    draws: Draws = (),
+) -> Task:
+    """Return the task in which a table's law is measured at a value, beside plants that are placed there."""
+    plant, params = design[0], place_variable(*design, table.over, value)
+    task = make_task(plant, plant.complete(params), spec, others, draws)
+    task = feed_link(task, table.find_gains(value).link)
+    return task if outer is None else task.enclosed(outer, command_of(plant, params, spec.regulated).per_effort)
 
 
 def place_variable(plant: Plant, params: ParameterSet, over: str, value: float) -> ParameterSet:

@@ -336,9 +336,9 @@ class Task:
 
     def loop(self, x: LawNumbers, plant: int = 0) -> Loop | DiscLoop:
         """Return the loop around one plant."""
-        return self._close(plant, self.law_of(x))
+        return self.close(plant, self.law_of(x))
 
-    def _close(self, row: int, law: Law) -> Loop | DiscLoop:
+    def close(self, row: int, law: Law) -> Loop | DiscLoop:
         """Return the loop of a law around one plant, with the outer loop where its link moves."""
         moved = None if self.moved is None else self.moved.close(row, law)
         return close_plant(self.plants[row], law) if moved is None else moved
@@ -349,7 +349,7 @@ class Task:
         if self.moved is None:
             gains = replace(gains, prefilter=None)  # which is no part of the loop
         law = self._make_law(gains)
-        return all(self._close(row, law).is_stable() for row in range(len(self.plants)))
+        return all(self.close(row, law).is_stable() for row in range(len(self.plants)))
 
     def grid(self, f: Frequencies, rows: Sequence[int] | None = None) -> Grid:
         """Return the responses of the plants, or of some of them, at frequencies."""
@@ -543,7 +543,7 @@ class Task:
         """Return the figures of a plant's loop; of the design plant those of the force law alone, with the margins of
         the outer loop around it.
         """
-        whole = self._close(row, law)
+        whole = self.close(row, law)
         figures = whole.figures(self.spec.bandwidth_hz) if isinstance(whole, DiscLoop) else whole.figures()
         if self.moved is None or row >= self.design_states or not self.moved.moves(row):
             return figures

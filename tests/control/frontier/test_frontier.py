@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ import pytest
 import seaopt as so
 from seaopt.cli import main
 from seaopt.cli.frontier import parse_bandwidths
-from seaopt.control import sweep
+from seaopt.control import sweep, tune_schedule
 from seaopt.errors import ControlError
+from seaopt.executors import Processes
 from tests.control.loops.test_loop import independent
 
 PROBLEM = """
@@ -61,6 +63,62 @@ def test_a_row_says_what_friction_costs(stand, thor):
     assert row.without_sticking.disturbance <= row.disturbance * 1.001
     table = repr(sweep(stand, thor.update(f_c=50.0), spec, [40]))
     assert "friction: by how much it raises the integral" in table and "%" in table
+
+
+POINTS = [5e5, 6e5]
+OF_POINTS = so.ControllerSpec(structure="pd", max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
+
+
+def test_rows_of_a_schedule_are_its_worst_places(stand, swing, thor):
+    """At the points and the values that are judged between them, of the law that is tuned for that bandwidth alone."""
+    found = sweep(stand, thor, OF_POINTS, [20, 60], {"swing": swing}, over="k", points=POINTS)
+    assert [row.met for row in found.rows] == [True, False] and found.over == "k"
+    assert "max_sensitivity" in found.rows[1].blocked_by[0]
+    row, schedule = found.rows[0], found.controllers[0]
+    alone = tune_schedule(stand, thor, replace(OF_POINTS, bandwidth_hz=20), "k", POINTS, {"swing": swing})
+    assert [one.gains for one in schedule.controllers] == [one.gains for one in alone.controllers]
+    f = np.geomspace(0.1, 499.9, 5_000)
+    inside = f <= 20
+    ms, left, noise = {}, [], []
+    for value in (*POINTS, *(place.value for place in schedule.between)):
+        law, values = schedule.at(value), thor.update(k=value)
+        for name, plant in {"design plant": stand, "swing": swing}.items():
+            s, _, back = independent(law.close(plant, values), f)
+            s = np.abs(1 / (1 + s))
+            ms[name, value] = s.max()
+            left.append(np.trapezoid(s[inside], np.log(f[inside])))
+            noise.append(np.abs(back).max() if plant is stand else 0.0)
+    assert row.ms == pytest.approx(max(ms.values()), rel=1e-3)
+    assert ms[row.ms_plant, row.ms_place] == pytest.approx(row.ms, rel=1e-3)
+    assert row.disturbance == pytest.approx(max(left), rel=1e-2)
+    assert row.noise_gain == pytest.approx(max(noise), rel=1e-3)
+    assert row.force_limit_N == min(schedule.at(value).force_limit(20.0) for value in POINTS)
+    assert f"k = {row.ms_place:.4g}" in " ".join(repr(found).split())
+
+
+def test_a_schedule_is_swept_in_other_processes_alike(stand, thor):
+    options = {"over": "k", "points": POINTS}
+    with Processes(2) as executor:
+        apart = sweep(stand, thor, OF_POINTS, [20, 30], executor=executor, **options)
+    assert [row.to_dict() for row in apart.rows] == [
+        row.to_dict() for row in sweep(stand, thor, OF_POINTS, [20, 30], **options).rows
+    ]
+
+
+@pytest.mark.slow
+def test_a_row_of_a_schedule_says_what_friction_and_structure_cost(stand, thor):
+    spec = so.ControllerSpec(structure="pd", max_sensitivity=1.6, max_noise_gain=25)
+    options = {"over": "k", "points": POINTS, "free_law": True}
+    (row,), (free,) = (
+        sweep(stand, thor.update(f_c=f_c), spec, [40], {"twin": stand}, **options).rows for f_c in (50.0, 0.0)
+    )  # fmt: skip
+    assert free.without_sticking is None
+    assert row.without_sticking.disturbance == pytest.approx(free.disturbance, rel=1e-2)
+    bounds = [
+        sweep(stand, thor.update(f_c=0.0, k=k), spec, [40], {"twin": stand}, free_law=True).rows[0].free_law.bound
+        for k in POINTS
+    ]
+    assert min(abs(free.free_law.bound / bound - 1.0) for bound in bounds) < 1e-3
 
 
 def test_the_command_writes_table_json_and_figure(tmp_path, monkeypatch, capsys):

@@ -15,7 +15,7 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.bench import Chirp, Noise
-from seaopt.control import Gains, Loop
+from seaopt.control import Gains, Loop, sweep
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import count_response_samples
 from seaopt.control.loops.measured.loop import LEFT, DiscLoop, bound_disc, leave_positive, measure_discs
@@ -259,3 +259,8 @@ def test_what_is_left_of_a_measured_loop_is_positive_and_smooth():
     assert leave_positive(at)[2] > 0
     slopes = (leave_positive(LEFT + np.array([0.0, step])) - leave_positive(LEFT - np.array([step, 0.0]))) / step
     assert slopes == pytest.approx([1.0, 1.0], abs=1e-4)
+
+
+def test_a_schedule_whose_design_plant_is_measured_is_not_swept():
+    with pytest.raises(ControlError, match="over = k: a measured response stands at one value"):
+        sweep(exact(1e-3), THOR, so.ControllerSpec(), [20], over="k", points=[5e5, 6e5])

@@ -14,7 +14,7 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
-from seaopt.control import Impedance, add_impedance, critical_impedance, tune_schedule
+from seaopt.control import Impedance, add_impedance, critical_impedance, sweep, tune_schedule
 from seaopt.control.laws.command import command_of
 from seaopt.control.running.fed_back import close_whole, split_states
 from seaopt.control.tuning import interior_point
@@ -354,6 +354,18 @@ def test_a_schedule_keeps_its_limits_with_its_outer_loop():
         assert ms <= 1.6 * (1 + 1e-4) and mt <= 1.3 * (1 + 1e-4)
     again = type(schedule).from_dict(schedule.to_dict(), HELD, VALUES, schedule.others)
     assert again.met and [place.broken for place in again.between] == [place.broken for place in schedule.between]
+
+
+def test_a_sweep_is_of_laws_with_their_outer_loop():
+    """Of what is tuned at that bandwidth alone; without, Mt is beyond its limit there."""
+    found = sweep(HELD, VALUES, OF_KNEE, [15.0], {"knee": KNEE}, outer=lambda law: give_outer(ASKED, law).outer)
+    (law,), (row,) = found.controllers, found.rows
+    assert row.met and law.outer.impedance == ASKED
+    ms, mt = measure_by_hand(law, ASKED)
+    assert ms <= 1.6 * (1 + 1e-4) and mt <= 1.3 * (1 + 1e-4)
+    assert row.ms == pytest.approx(max(ms, law.close(HELD, VALUES).figures().ms), rel=1e-3)
+    alone, _ = tune_knee(ASKED)
+    assert law.gains == pytest.approx(alone.gains, rel=1e-2)
 
 
 def test_an_outer_loop_that_is_refused_is_an_error():

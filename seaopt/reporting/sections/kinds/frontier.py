@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from seaopt.control import Frontier
-from seaopt.control.frontier.frontier import FrontierRow
+from seaopt.control.frontier.rows import FrontierRow
 from seaopt.control.laws.verdict import shorten_blocked
 from seaopt.formatting import MISSING, format_number, join_words
 from seaopt.reporting.sections.data import Section, Table, mark_met
@@ -21,7 +21,7 @@ def describe(frontier: Frontier) -> list[Section]:
             mark_met(row.met, "yes", "no"),
             format_number(row.noise_gain, 3),
             format_number(row.ms),
-            row.ms_plant,
+            _name_worst(frontier, row),
             format_number(row.sensitivity_bandwidth_hz, 3),
             format_number(row.phase_margin_deg, 3),
             format_number(row.force_limit_N),
@@ -49,12 +49,19 @@ def describe(frontier: Frontier) -> list[Section]:
     ]
 
 
+def _name_worst(frontier: Frontier, row: FrontierRow) -> str:
+    """Return the plant with the largest Ms, and of a schedule where."""
+    return row.ms_plant if row.ms_place is None else f"{row.ms_plant}, {frontier.over} = {row.ms_place:.4g}"
+
+
 def _explain_columns(frontier: Frontier, called: Mechanics) -> str:
     free = next((row.free_law for row in frontier.rows if row.free_law is not None), None)
     columns = [
         f"noise: peak of |F_m/noise on the {called.word}|, {called.gain}; Ms: of the worst plant; |S| Hz: below -3 dB "
         "up to this frequency; limit: largest reference at that frequency before the command saturates"
     ]
+    if frontier.over is not None:
+        columns.append("each of the point, or of the value between points, where it is worst")
     if any(row.without_sticking is not None for row in frontier.rows):
         columns.append("friction: by how much it raises the integral of |S|")
     if free is not None:

@@ -1,0 +1,125 @@
+"""What a sweep of bandwidths has found: a row for each, of one law or of a schedule."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from seaopt.control.frontier.free_law import FreeLaw
+from seaopt.control.laws.controller import Controller
+from seaopt.control.laws.limits import MeasuredLoop
+from seaopt.control.loops.law import Law
+from seaopt.control.scheduling.scheduled_controller import ScheduledController
+from seaopt.control.tuning.optimisation_problem import Task
+from seaopt.control.tuning.tuner import disturbance
+from seaopt.records import PlotAccessor, Result, Worded, record
+from seaopt.units import LINEAR, Mechanics
+
+FRONTIER_SCHEMA = "seaopt/frontier/1"
+
+
+@record
+class SlidingAlone(Result):
+    """The best law for the sliding plants alone: whether limits are met, noise gain and disturbance, as in a row."""
+
+    met: bool
+    noise_gain: float
+    disturbance: float
+
+
+@record
+class FrontierRow(Result):
+    """One bandwidth; what is not said to be of the worst plant is of the design plant. Of a schedule each figure is of
+    the place, of its points and the values between them that are judged, where it is worst.
+    """
+
+    bandwidth_hz: float
+    met: bool  # whether every limit is met; if not, the figures are those of the controller that misses them least
+    noise_gain: float  # N/N
+    ms: float  # ms, ms_plant: largest Ms of all plants, and whose it is
+    ms_plant: str
+    ms_place: float | None  # of a schedule: the value of its variable there
+    disturbance: float  # integral over ln f of abs(S) from 0.1 Hz to the bandwidth, worst plant
+    sensitivity_bandwidth_hz: float  # abs(S) stays below -3 dB up to here
+    phase_margin_deg: float | None  # phase_margin_deg, disk_margin: as in `LoopFigures`
+    disk_margin: float
+    # largest amplitude of the reference at the bandwidth before the current saturates; None without a limit
+    force_limit_N: float | None
+    blocked_by: tuple[str, ...]  # the limits that are broken
+    # what could be had if no plant ever stuck; None where none has friction. The difference is what friction costs
+    without_sticking: SlidingAlone | None = None
+    # the best that any linear law could do on the design plant; None where it was not asked for. The difference to the
+    # disturbance, or with that objective to the noise gain, is what the structure costs, at most
+    free_law: FreeLaw | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the row of frontier.json."""
+        fields, alone = asdict(self) | {"feasible": self.met}, self.without_sticking
+        return fields if alone is None else fields | {"without_sticking": asdict(alone) | {"feasible": alone.met}}
+
+
+@record(eq=False, repr=False)
+class Frontier(Result, Worded):
+    """The rows of a sweep, and their controllers."""
+
+    plot = PlotAccessor()
+
+    rows: tuple[FrontierRow, ...]
+    controllers: tuple[Controller, ...] | tuple[ScheduledController, ...]
+    over: str | None = None  # the variable that the controllers are scheduled over
+
+    @property
+    def met(self) -> bool:
+        """Whether every limit is met at some bandwidth."""
+        return any(row.met for row in self.rows)
+
+    @property
+    def mechanics(self) -> Mechanics:
+        """Units and words of what the controllers command."""
+        return self.controllers[0].command.mechanics if self.controllers else LINEAR
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the content of frontier.json (schema seaopt/frontier/1)."""
+        return {
+            "schema": FRONTIER_SCHEMA,
+            "met": self.met,
+            "over": self.over,
+            "rows": [row.to_dict() for row in self.rows],
+            "controllers": [controller.to_dict() for controller in self.controllers],
+        }
+
+
+def measure_disturbance(task: Task, law: Law) -> float:
+    """Return the integral of abs(S) of the plant that has most of it."""
+    return max(disturbance(task.close(i, law), task.spec.bandwidth_hz) for i in range(len(task.plants)))
+
+
+def make_row(
+    task: Task,
+    law: Law,
+    loops: list[MeasuredLoop],
+    controller: Controller,
+    *,
+    without_sticking: SlidingAlone | None = None,
+    free_law: FreeLaw | None = None,
+    place: float | None = None,
+) -> FrontierRow:
+    """Return the row of a law, which was measured in these loops of a task."""
+    design, f_b = loops[0].figures, task.spec.bandwidth_hz
+    worst = max(loops, key=lambda loop: loop.figures.ms)
+    return FrontierRow(
+        bandwidth_hz=f_b,
+        met=controller.met,
+        noise_gain=design.noise_gain,
+        ms=worst.figures.ms,
+        ms_plant=worst.name,
+        ms_place=place,
+        disturbance=measure_disturbance(task, law),
+        sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz,
+        phase_margin_deg=design.phase_margin_deg,
+        disk_margin=design.disk_margin,
+        force_limit_N=controller.force_limit(f_b),
+        blocked_by=controller.blocked_by,
+        without_sticking=without_sticking,
+        free_law=free_law,
+    )

@@ -1,0 +1,159 @@
+"""Sweep the bandwidth of a schedule: it is tuned at each by itself, and its figures are those of its worst place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from seaopt.control.frontier.free_law import bound_free_law
+from seaopt.control.frontier.rows import FrontierRow, SlidingAlone, make_row
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.control.loops.sampled_plant import DigitalPlant
+from seaopt.control.scheduling.scheduled_controller import ScheduledController, make_place_task, place_plants
+from seaopt.control.scheduling.tuning import find_response_place, tune_schedule
+from seaopt.control.tuning.tuner import Draws, RobustTo
+from seaopt.executors import Shared, map_ordered
+from seaopt.frequency import MeasuredResponse
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
+from seaopt.progress import Progress, divide, ignore, prefix
+from seaopt.records import record
+
+
+def slide_plants(
+    plant: Plant | MeasuredResponse, params: ParameterSet, robust_to: RobustTo
+) -> tuple[Plant | MeasuredResponse, RobustTo]:
+    """Return the plants that slide; measured ones are what they are."""
+    sliding: dict[str, Plant | tuple[Plant, ParameterSet] | MeasuredResponse] = {}
+    for name, other in robust_to.items():
+        if isinstance(other, MeasuredResponse):
+            sliding[name] = other
+            continue
+        model, values = other if isinstance(other, tuple) else (other, params)
+        sliding[name] = (take_sliding(model, model.complete(values)), values)
+    design = plant if isinstance(plant, MeasuredResponse) else take_sliding(plant, plant.complete(params))
+    return design, sliding
+
+
+@record(eq=False)
+class ScheduleSweep:
+    """What is tuned at every bandwidth."""
+
+    plant: Plant
+    params: ParameterSet
+    over: str
+    points: Sequence[float]
+    robust_to: RobustTo
+    draws: Draws
+    outer: Callable[[Any], OuterLoop | None] | None
+    free_law: bool
+
+    def tune(self, spec: ControllerSpec, progress: Progress) -> ScheduledController:
+        """Return the schedule of a specification."""
+        options: dict[str, Any] = {"draws": self.draws, "outer": self.outer, "progress": progress}
+        return tune_schedule(self.plant, self.params, spec, self.over, self.points, self.robust_to, **options)
+
+    @property
+    def sticks(self) -> bool:
+        """Whether there is friction that a plant sticks with."""
+        others = [other if isinstance(other, tuple) else (other, self.params) for other in self.robust_to.values()]
+        models = [(plant, values) for plant, values in others if isinstance(plant, Plant)]
+        every = [(self.plant, self.params), *models]
+        return any(take_sliding(plant, plant.complete(values)) is not plant for plant, values in every)
+
+    def slide(self) -> ScheduleSweep:
+        """Return the same with plants that slide alone."""
+        design, others = slide_plants(self.plant, self.params, self.robust_to)
+        assert isinstance(design, Plant)
+        return replace(self, plant=design, robust_to=others)
+
+    def measure(self, schedule: ScheduledController, *, free_law: bool = False) -> list[FrontierRow]:
+        """Return a row for each place of a schedule; with the best of all linear laws at its points."""
+        rows: list[FrontierRow] = []
+        responses = [(name, at) for name, at in self.robust_to.items() if isinstance(at, MeasuredResponse)]
+        for value in sorted((*schedule.points, *(place.value for place in schedule.between))):
+            seen = {
+                name: response
+                for name, response in responses
+                if find_response_place(self.over, name, response, self.params) == value
+            }
+            spec = replace(schedule.spec, bandwidth_hz=schedule.asked_hz(value))
+            task = make_place_task(
+                schedule.table,
+                value,
+                spec,
+                schedule.design,
+                {**place_plants(schedule.others, self.over, value), **seen},
+                schedule.outer,
+                self.draws,
+            )
+            law, free = schedule.table.law(value), None
+            if free_law and value in schedule.points and isinstance(task.plants[0], DigitalPlant):
+                free = bound_free_law(task.plants[0], spec, [law])
+            loops = task.measure_law(law, filter_samples=0.0, integral_rad_s=0.0)
+            rows.append(make_row(task, law, loops, schedule.at(value), free_law=free, place=value))
+        return rows
+
+
+def sweep_schedule(
+    swept: ScheduleSweep, specs: Sequence[ControllerSpec], executor: Executor | None, progress: Progress
+) -> list[tuple[FrontierRow, ScheduledController]]:
+    """Return the row and the schedule of each specification."""
+    parts = divide(progress, *(1.0 for _ in specs))
+    if executor is None:
+        return [_tune_row(swept, spec, part) for spec, part in zip(specs, parts, strict=True)]
+    found: list[tuple[FrontierRow, ScheduledController]] = []
+    done = map_ordered(partial(_tune_part, Shared(swept)), specs, executor)
+    for spec, part, one in zip(specs, parts, done, strict=True):
+        part(f"{spec.bandwidth_hz:g} Hz", 1.0)
+        found.append(one)
+    return found
+
+
+def _tune_part(swept: Shared[ScheduleSweep], spec: ControllerSpec) -> tuple[FrontierRow, ScheduledController]:
+    return _tune_row(swept.value, spec, ignore)
+
+
+def _tune_row(
+    swept: ScheduleSweep, spec: ControllerSpec, progress: Progress
+) -> tuple[FrontierRow, ScheduledController]:
+    """Return the row of one bandwidth with its schedule."""
+    whole, part = divide(prefix(progress, f"{spec.bandwidth_hz:g} Hz"), 1.0, float(swept.sticks))
+    schedule, alone = swept.tune(spec, whole), None
+    if swept.sticks:
+        sliding = swept.slide()
+        found = sliding.tune(spec, part)
+        places = sliding.measure(found)
+        alone = SlidingAlone(
+            met=found.met,
+            noise_gain=max(row.noise_gain for row in places),
+            disturbance=max(row.disturbance for row in places),
+        )
+    row = _take_worst(swept.measure(schedule, free_law=swept.free_law), schedule)
+    return replace(row, without_sticking=alone), schedule
+
+
+def _take_worst(rows: Sequence[FrontierRow], schedule: ScheduledController) -> FrontierRow:
+    """Return the figures of a schedule, each of the place where it is worst."""
+    worst = max(rows, key=lambda row: row.ms)
+    free = [row for row in rows if row.free_law is not None]
+    phases = [row.phase_margin_deg for row in rows if row.phase_margin_deg is not None]
+    limits = [row.force_limit_N for row in rows if row.force_limit_N is not None]
+    objective = "noise_gain" if schedule.spec.objective == "noise" else "disturbance"
+    return replace(
+        worst,
+        met=schedule.met,
+        noise_gain=max(row.noise_gain for row in rows),
+        disturbance=max(row.disturbance for row in rows),
+        sensitivity_bandwidth_hz=min(row.sensitivity_bandwidth_hz for row in rows),
+        phase_margin_deg=min(phases, default=None),
+        disk_margin=min(row.disk_margin for row in rows),
+        force_limit_N=min(limits, default=None),
+        blocked_by=schedule.broken,
+        free_law=max(free, key=lambda row: getattr(row, objective)).free_law if free else None,
+    )
