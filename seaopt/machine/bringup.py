@@ -12,12 +12,13 @@ from jaxtyping import Float
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
 from seaopt.control import Controller, ControllerSpec, ForceMPC, MPCSpec, ScheduledController, force_mpc
+from seaopt.control.running.closed_loop import LoopRun
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
 from seaopt.machine.design_run import run_design
 from seaopt.machine.excitation import Excitation, design_excitation
-from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
+from seaopt.machine.response.verdicts import LEAST_PHASES, find_friction, has_dry_friction
 from seaopt.machine.stepped import Source, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -34,6 +35,9 @@ UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
 DRAWS, SEED = 60, 1
 STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
 STOP = 1.3  # times what is predicted: where to stop
+MOVES = 2.0  # times the dry friction: the effort that a stage's reference is to make where the limits leave room
+BARELY = 1.2  # times the dry friction: the effort where the limits leave no room for that
+RAISES, ONWARD = 4, 1.1  # times that an amplitude is raised to it, and by which factor at least
 NOISE_RUNS = 4  # with other noise each, whose largest peaks count
 OF_A_STAGE = (  # options of predictive control that a stage may have otherwise
     "bandwidth_hz", "min_sensitivity_bandwidth_hz", "current_limit_A", "command_limit", "largest_force_N",
@@ -79,6 +83,11 @@ class Stage:
         In what the stage differs from what was planned.
     place : float or None
         Where a schedule's variable is to stand.
+    effort : float or None
+        Of a plant with dry friction: the most by which the effort swings about its middle while the periods are
+        played, by simulation.
+    friction : float or None
+        The effort that dry friction takes: below it the motor does not move.
     """
 
     name: str
@@ -93,6 +102,13 @@ class Stage:
     stop: Mapping[str, float]
     note: str = ""
     place: float | None = None
+    effort: float | None = None
+    friction: float | None = None
+
+    @property
+    def still(self) -> bool:
+        """Whether dry friction holds the motor while this is played."""
+        return self.effort is not None and self.friction is not None and self.effort <= self.friction
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -142,6 +158,9 @@ def _describe(stage: Stage) -> dict[str, Any]:
             "phases": len(excitation.waves),
             "frequency_hz": excitation.frequency_hz,
         },
+        "friction": None
+        if stage.friction is None
+        else {"dry": stage.friction, "effort": stage.effort, "moves": not stage.still},
         "peaks": excitation.peaks,
         "limits": excitation.limits,
         "stop": stage.stop,
@@ -187,7 +206,7 @@ def bring_up(
         where there is none, the same law with that fraction of its effort.
     share : float
         Of each limit that the reference's excitation may take with the full law; in the stages before, times their
-        fraction.
+        fraction, or as much as moves the motor against twice its dry friction.
     bias : float
         The reference's mean, in its unit.
     limits : mapping of str to float, optional
@@ -268,15 +287,15 @@ def bring_up(
         progress(f"stage {len(stages) + 1} of {count}, {text}", len(stages) / count)
 
     for number, fraction in enumerate(sorted(fractions), start=1):
-        law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell)
-        part = options | {"share": share * fraction, "place": places[0]}
+        law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell, share)
+        part = options | {"share": share * fraction, "most": share, "place": places[0]}
         keep(_make_stage(f"stage_{number}", law, judged, note, draws, part))
     if certificate is None:
         tell("certifying the law itself")
         certificate = certifying(controller)
     for number, place in enumerate(places, start=1):
         name = FULL if len(places) == 1 else f"{FULL}_{number}"
-        keep(_make_stage(name, controller, certificate, "", draws, options | {"place": place}))
+        keep(_make_stage(name, controller, certificate, "", draws, options | {"most": share, "place": place}))
     return BringUp(stages=tuple(stages))
 
 
@@ -320,8 +339,11 @@ def _find_stage(
     tuning: Callable[[float], Source],
     certifying: Callable[[Any], Certificate],
     tell: Callable[[str], None],
+    share: float,
 ) -> tuple[Source, Certificate, str]:
-    """Return the law of a stage, its certificate, and in what it is another one than planned."""
+    """Return the law of a stage, its certificate, and in what it is another one than planned. `share`: of the limit of
+    its command that its reference may take.
+    """
     asked = source.spec.bandwidth_hz
     for factor in UPWARDS:
         part = fraction * factor
@@ -339,12 +361,26 @@ def _find_stage(
         if judged.met:
             note = "" if factor == 1.0 else f"{part * asked:.3g} Hz is the nearest to {asked * fraction:.3g} Hz"
             return law, judged, note
-    lower = lower_effort(source, fraction)
+    part = _reach_friction(stand(source, None), fraction, share)
+    lower = lower_effort(source, part)
+    above = "" if part == fraction else f", not {100.0 * fraction:g} %, which its reference takes to move the motor"
     note = (
-        f"the full law with {100.0 * fraction:g} % of its effort: none near {fraction:g} of its bandwidth is certified"
+        f"the full law with {100.0 * part:.3g} % of its effort{above}: none near {fraction:g} of its bandwidth is "
+        "certified"
     )
-    tell(f"certifying with {100.0 * fraction:g} % of the effort")
+    tell(f"certifying with {100.0 * part:.3g} % of the effort")
     return lower, certifying(lower), note
+
+
+def _reach_friction(controller: Controller, fraction: float, share: float) -> float:
+    """Return the fraction of a law's effort, or the least above it, of whose limit a share moves the motor against dry
+    friction; the fraction itself where all of it would not.
+    """
+    dry, limit = find_friction(controller), controller.command_limit
+    if not dry or limit is None:
+        return fraction
+    needed = (times * dry * abs(controller.per_effort) / (share * limit) for times in (MOVES, BARELY))
+    return max(fraction, next((part for part in needed if part < 1.0), fraction))
 
 
 def _make_stage(
@@ -355,14 +391,8 @@ def _make_stage(
     draws: Sequence[Mapping[str, float]],
     options: Mapping[str, Any],
 ) -> Stage:
-    place, sensors = options["place"], options["sensors"]
-    options = {key: value for key, value in options.items() if key not in ("place", "sensors")}
-    controller = stand(source, place)
-    dry = has_dry_friction(controller)
-    phases, periods = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
-    excitation = design_excitation(controller, phases=phases, periods=periods, **options)
-    excitation = replace(excitation, peaks=_add_noise(controller, excitation, sensors))
-    excitation = replace(excitation, peaks=_add_terms(controller, excitation))
+    place, controller = options["place"], stand(source, options["place"])
+    excitation, effort, friction = _excite(controller, options)
     assert controller.design is not None
     plant, values = controller.design
     sets = [values, *(place_values(plant, values, each) for each in draws)]
@@ -370,7 +400,7 @@ def _make_stage(
     f = excitation.frequency_hz
     count = round(STEP_PERIODS / controller.spec.bandwidth_hz / controller.sample_time_s)
     runs = [loop.simulate(np.ones(count)) for loop in loops]
-    steps, effort = (np.array([run[k] for run in runs]) for k in (0, 1))
+    steps, efforts = (np.array([run[k] for run in runs]) for k in (0, 1))
     limit = controller.command_limit
     time = controller.sample_time_s * np.arange(count)
     return Stage(
@@ -382,23 +412,56 @@ def _make_stage(
         tracking=_band(f, np.abs([loop.tracking(f) for loop in loops])),
         sensitivity=_band(f, np.abs([loop.sensitivity(f) for loop in loops])),
         step=_band(time, steps),
-        step_size=None if limit is None else float(limit / controller.per_effort / np.max(np.abs(effort))),
+        step_size=None if limit is None else float(limit / controller.per_effort / np.max(np.abs(efforts))),
         stop={key: min(STOP * peak, excitation.limits.get(key, np.inf)) for key, peak in excitation.peaks.items()},
         note=note,
         place=place,
+        effort=effort,
+        friction=friction,
     )
 
 
-def _add_terms(controller: Controller, excitation: Excitation) -> dict[str, float]:
-    """Return the peaks of a reference with the terms of a law, and where one set of phases follows another: those of a
-    run where they are larger.
+def _excite(controller: Controller, options: Mapping[str, Any]) -> tuple[Excitation, float | None, float | None]:
+    """Return the reference of a stage; of a plant with dry friction the effort that it makes and the friction, with an
+    amplitude that moves the motor where the largest share of the limits, "most", allows it.
     """
-    peaks = dict(excitation.peaks)
+    keys, dry = ("bias", "limits", "seed"), has_dry_friction(controller)
+    phases, periods = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
+    given = {key: options[key] for key in keys} | {"phases": phases, "periods": periods}
+    share, most, friction = options["share"], options["most"], find_friction(controller)
+
+    def play(share: float) -> tuple[Excitation, LoopRun | None, float | None]:
+        excitation = design_excitation(controller, share=share, **given)
+        run = _run_terms(controller, excitation)
+        return excitation, run, None if run is None or not dry else _measure_swing(controller, excitation, run)
+
+    excitation, run, effort = play(share)
+    for _ in range(RAISES):
+        if effort is None or effort >= MOVES * friction or share >= most:
+            break
+        share = min(share * max(MOVES * friction / max(effort, 1e-12), ONWARD), most)
+        excitation, run, effort = play(share)
+    peaks = _add_noise(controller, excitation, options["sensors"])
+    if run is not None:
+        signals = {**run.outputs, controller.command.input: run.current}
+        peaks = {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+    return replace(excitation, peaks=peaks), effort, friction if dry else None
+
+
+def _run_terms(controller: Controller, excitation: Excitation) -> LoopRun | None:
+    """Return the run of a reference where the law has terms, or where one set of phases follows another: its peaks may
+    be larger than those of the lines.
+    """
     if controller.design is None or (controller.compensation is None and len(excitation.waves) == 1):
-        return peaks
-    run = run_design(controller, [controller.design[1]], excitation.reference)
-    signals = {**run.outputs, controller.command.input: run.current}
-    return {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+        return None
+    alone = replace(controller, outer=None)  # a stage is of the force law alone
+    return run_design(alone, [controller.design[1]], excitation.reference)
+
+
+def _measure_swing(controller: Controller, excitation: Excitation, run: LoopRun) -> float:
+    """Return the most by which the effort swings about its middle while the periods are played."""
+    period = excitation.waves.shape[1]
+    return float(np.ptp(run.current[0, period:-period])) / 2.0 / abs(controller.per_effort)
 
 
 def _add_noise(controller: Controller, excitation: Excitation, sensors: Sensors | None) -> dict[str, float]:

@@ -11,8 +11,7 @@ import numpy as np
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup import Band, BringUp, Stage
-from seaopt.machine.response.verdicts import has_dry_friction
-from seaopt.plants.friction import find_dry_friction
+from seaopt.machine.response.verdicts import find_friction, has_dry_friction
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
@@ -40,6 +39,15 @@ SLIDES = (
     "many times that lie outside the bands, also on a right machine. seaopt accept judges such logs at the amplitude "
     "that was played."
 )
+STILL = (
+    "THIS STAGE DOES NOT MOVE THE MOTOR: its effort swings by {} at most, and dry friction holds {}; no amplitude "
+    "within its share of the limits is above. It tells whether the law runs, at its rate, with the signs and units of "
+    "command and reading, and whether the loop is quiet while the motor is stuck. It tells nothing of bandwidth, peaks "
+    "and margins of the machine as it moves. Give it a larger --share or larger limits, or watch the next stage as "
+    "the first that moves."
+)
+MOVED = "Its effort swings by {} at most, and dry friction holds {}: the motor moves."
+HELD = "No motion is expected in {}: dry friction holds the motor there."
 NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
 
 
@@ -81,11 +89,13 @@ def describe(result: BringUp) -> list[Section]:
     head = ("stage", "law", "bandwidth (Hz)", "stuck (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
     last = result.stages[-1].controller
     outer = () if last.outer is None else (OUTER.format(PLACE if last.renders else FORCE),)
+    still = [stage.name for stage in result.stages if stage.still]
+    held = (HELD.format(join_words(still)),) if still else ()
     overview = Section(
         title="Stages",
         part="stages",
         tables=(Table(head=head, rows=rows, align="<<>>>>>>"),),
-        remarks=(*_explain_bandwidths(last), *(f"Stop a stage when {text}" for text in ALWAYS), NEXT, *outer),
+        remarks=(*held, *_explain_bandwidths(last), *(f"Stop a stage when {text}" for text in ALWAYS), NEXT, *outer),
     )
     return [overview, *(_describe_stage(stage) for stage in result.stages)]
 
@@ -100,9 +110,17 @@ def _explain_friction(controller: Controller) -> tuple[str, ...]:
     """Return of what the bands are where the plant has dry friction, which they leave out."""
     if not has_dry_friction(controller) or controller.design is None:
         return ()
-    plant, values = controller.design
-    friction = sum(find_dry_friction(plant, plant.complete(values)).values())
+    friction = find_friction(controller)
     return (SLIDES.format(f"{format_number(friction, 3)}{unit_after(controller.command.effort_unit)}"),)
+
+
+def _say_whether_it_moves(stage: Stage) -> tuple[str, ...]:
+    """Return whether what is played moves the motor, where it has dry friction."""
+    if stage.effort is None or stage.friction is None:
+        return ()
+    unit = unit_after(stage.controller.command.effort_unit)
+    sizes = (f"{format_number(value, 3)}{unit}" for value in (stage.effort, stage.friction))
+    return ((STILL if stage.still else MOVED).format(*sizes),)
 
 
 def _list_row(stage: Stage) -> tuple[Any, ...]:
@@ -143,6 +161,7 @@ def _describe_stage(stage: Stage) -> Section:
         f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)}{ring}.",
         f"Expect: a step of the reference{_say_size(stage)} peaks at {' to '.join(dict.fromkeys(top))} of its size "
         f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
+        *_say_whether_it_moves(stage),
         *_explain_friction(controller),
     ]
     rows = tuple(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from seaopt.control import Controller
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.causes import Cause, read_gains
@@ -14,7 +15,7 @@ from seaopt.machine.differences.explanations import Difference
 from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
-from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, Judged, Measured, Response
+from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, SHORT_BY, Judged, Measured, Response
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -71,6 +72,17 @@ RATE = (
     "These figures are in the machine's seconds: the law is stepped at {} times the rate that the log's clock says, "
     "and all that is read off that clock is wrong."
 )
+STILL = (
+    "In these logs dry friction holds the motor: the effort swings by {} at most, and friction takes {}. The figures "
+    "are of the stuck machine. They tell that the law runs, with the signs and units that it was exported for, and "
+    "that the loop is quiet while stuck; of the machine as it moves they tell nothing. Play a larger reference."
+)
+STUCK = (
+    "The bandwidth that is judged is that of the machine that is stuck, which any amplitude has: it is not the {} that "
+    "was asked of the machine as it slides. At the amplitude of the log it is {}{}."
+)
+REACHES = ", which is what was asked"
+SHORT = "; a larger reference comes nearer to what was asked"
 STABILITY = (
     "Stability is the least |1 + L| over the radius of its disc (no unit): above 1 no disc holds zero, where the loop "
     "would be at its limit of stability."
@@ -179,6 +191,8 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
         limited = [row for row in response.judged if row.limit is not None]
         counts = {outcome: sum(row.outcome == outcome for row in limited) for outcome in OUTCOMES}
         parts.append(f"{counts['confirmed']} of {len(limited)} limits confirmed, {counts['refuted']} refuted")
+        if response.still:
+            parts.append("dry friction held the motor, so that they are of the stuck machine alone")
         reasons += [Reason(what=_say_refuted(row)) for row in limited if row.outcome == "refuted"]
         if counts["undecided"]:
             reasons.append(Reason(what=f"the log does not decide {_say_undecided(response)}"))
@@ -191,10 +205,22 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons))
 
 
+def _name(row: Judged) -> str:
+    """Return the name of a figure, with the state of the machine that its limit is of."""
+    return f"{row.name}, {row.state}" if row.state else row.name
+
+
+def _say_stuck(row: Judged, controller: Controller) -> str:
+    """Return of which bandwidth the row is, and which one was asked."""
+    asked, value = controller.spec.bandwidth_hz, row.value or 0.0
+    sizes = (f"{format_number(each, 3)} Hz" for each in (asked, value))
+    return STUCK.format(*sizes, REACHES if value >= (1.0 - SHORT_BY) * asked else SHORT)
+
+
 def _say_refuted(row: Judged) -> str:
     if row.name == "stability":
         return "stability is refuted"
-    limit = f"{row.name} {row.sense} {format_number(row.limit)}{unit_after(row.unit)} is refuted"
+    limit = f"{_name(row)} {row.sense} {format_number(row.limit)}{unit_after(row.unit)} is refuted"
     at = "" if row.where_hz is None else f" at {format_number(row.where_hz, 3)} Hz"
     return f"{limit}: {format_number(row.value, 3)} ({_show_interval(row)}){at}"
 
@@ -215,7 +241,7 @@ def _say_undecided(response: Response) -> str:
     if periods := max((row.periods or 0 for row in rows), default=0):
         record.append(f"{periods} periods in all")
     wanted = join_words(record) or "more periods, or a larger reference"
-    others = [f"{join_words([row.name for row in rows])}: record {wanted}"] if rows else []
+    others = [f"{join_words([_name(row) for row in rows])}: record {wanted}"] if rows else []
     return "; ".join([*others, *near])
 
 
@@ -223,7 +249,7 @@ def _say_near(row: Judged) -> str:
     """Return that a figure lies at its limit."""
     unit, value = unit_after(row.unit), format_number(row.value, 4)
     return (
-        f"{row.name}: the estimate, {value}{unit}, is within {format_number(100.0 * (row.near or 0.0), 2)} % of the "
+        f"{_name(row)}: the estimate, {value}{unit}, is within {format_number(100.0 * (row.near or 0.0), 2)} % of the "
         f"limit as judged, {format_number(row.limit, 4)}{unit}, so that no record of sensible length decides (over an "
         "hour); play a larger reference, or ask for less or tune for more of it"
     )
@@ -262,7 +288,7 @@ def describe(result: Acceptance) -> list[Section]:
 def _describe_response(result: Acceptance, response: Response) -> Section:
     rows = tuple(
         (
-            row.name,
+            _name(row),
             "" if row.limit is None else Mark(text=row.outcome, style=OUTCOMES[row.outcome]),
             "" if row.limit is None else f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}",
             f"{format_number(row.value, 3)}{unit_after(row.unit)}",
@@ -277,7 +303,7 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     aside = ", ".join(_say_extent(part) for part in response.measured)
     remarks = [
         f"Each statement holds with a probability of {100.0 * response.confidence:g} %. Limits are those of the "
-        "specification with 5 % of grace, of the bandwidth 10 %; with dry friction that of the plant that is stuck. "
+        "specification with 5 % of grace, of the bandwidth 10 %. "
         "Nothing is said between the lines and beyond them.",
         STABILITY,
     ]
@@ -285,7 +311,12 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
         remarks.append(RATE.format(format_number(response.rate, 3)))
     if show_stuck_bandwidth(result.controller):
         both = say_bandwidths(result.controller, result.controller.achieved.bandwidth_hz)
-        remarks.append(f"Predicted is the actuator as it slides; its bandwidth is {both}.")
+        remarks.append(f"Predicted is the actuator as it slides, but for a figure stuck; its bandwidth is {both}.")
+    remarks += [_say_stuck(row, result.controller) for row in response.judged if row.state == "stuck"]
+    if response.still:
+        unit = unit_after(result.controller.command.effort_unit)
+        sizes = (f"{format_number(value, 3)}{unit}" for value in (response.effort, response.friction))
+        remarks.insert(0, STILL.format(*sizes))
     if response.at_amplitude_only:
         remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
     if any(row.outcome == "undecided" for row in response.judged if row.limit is not None):
@@ -408,7 +439,7 @@ def summarise(result: Acceptance) -> list[KeyFigure]:
         if row.limit is not None and row.name != "stability":
             limit = f"{row.sense} {format_number(row.limit)}{unit_after(row.unit)}, {row.outcome}"
             value = f"{format_number(row.value, 3)}{unit_after(row.unit)}"
-            figures.append(KeyFigure(name=row.name, value=value, against=limit))
+            figures.append(KeyFigure(name=_name(row), value=value, against=limit))
     return figures
 
 

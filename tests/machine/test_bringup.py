@@ -106,6 +106,61 @@ def test_where_no_slower_law_is_certified_it_is_the_same_with_less_effort(contro
     assert np.array_equal(stage.controller.law.a, controller.law.a)
 
 
+@pytest.fixture(scope="module")
+def rubbing():
+    """Return a knee with 6 N m of dry friction, of 23 N m that its motor makes, with its law and a certificate."""
+    plant = so.plants.rotary(link="locked")
+    stated = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "f_c": 0.06, "v_s": 1.0, "k_s": 300.0}
+    values = plant.complete(so.ParameterSet()).update(**stated)
+    spec = so.ControllerSpec(
+        bandwidth_hz=20, structure="pid_dob", measured="tau_s", max_sensitivity=1.6, max_noise_gain=45,
+        current_limit_A=9.0,
+    )  # fmt: skip
+    law = so.tune(plant, values, spec)
+    return plant, values, law, so.certify(law, {"knee": plant}, values, samples=5)
+
+
+def plan_first(rubbing, share):
+    """Return the bring-up whose first stage is the law with a quarter of its effort, or what its friction takes."""
+    plant, values, law, certificate = rubbing
+
+    def refuse(fraction):
+        raise so.SeaoptError("none")
+
+    options = {"certificate": certificate, "tune_stage": refuse, "certify_stage": lambda _: certificate}
+    return so.bring_up(
+        law, {"knee": plant}, values, samples=5, share=share, fractions=(0.25,), limits={"tau_s": 20.0}, **options
+    )
+
+
+@pytest.mark.parametrize(("share", "moves"), [(0.5, True), (0.2, False)])
+def test_a_stage_moves_the_motor_against_its_friction_or_says_that_it_does_not(
+    compiler, tmp_path, rubbing, share, moves
+):
+    """What is said is what the stage's own C does on a machine with the same friction."""
+    plan = plan_first(rubbing, share)
+    stage = plan.stages[0]
+    assert stage.still is not moves and stage.friction == pytest.approx(100 * 0.06)
+    content = plan.to_dict()["stages"][0]["friction"]
+    assert content["moves"] is moves and content["effort"] == pytest.approx(stage.effort)
+    text = " ".join(repr(plan).split()).partition("Stage full")[0]
+    assert ("the motor moves" in text) is moves and ("THIS STAGE DOES NOT MOVE THE MOTOR" in text) is not moves
+    bench = Bench(compiler, tmp_path, stage.controller)
+    log = bench.log(Machine.of_knee(rubbing[1]), stage.excitation.reference, noise=0.0)
+    assert np.max(np.abs(log["I"])) <= stage.stop["I"] and np.max(np.abs(log["tau_s"])) <= share * 20.0
+    speed = np.max(np.abs(np.diff(log["tau_s"]))) / 1e-3 / 300.0 * 100.0  # rad/s of the motor
+    assert speed > 3.0 if moves else speed < 1.2  # its friction is smoothed over 1 rad/s
+
+    result = so.accept(
+        stage.controller, [bench.log(Machine.of_knee(rubbing[1]), stage.excitation.reference, noise=0.01)]
+    )
+    assert result.replayed and result.response.still is not moves
+    (row,) = (each for each in result.response.judged if each.name == "bandwidth")
+    said = " ".join(repr(result).split())
+    assert row.state == "stuck" and row.limit < 10.0 and "not the 20 Hz that was asked" in said
+    assert ("dry friction held the motor" in said) is not moves
+
+
 def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(tmp_path):
     """The stuck plant is that of the equations: a motor that does not move behind its spring, but for v_s."""
     from seaopt.machine.bringup_page import write_bring_up_page

@@ -30,6 +30,7 @@ class Judged:
     where_hz: float | None  # the line that decides, or is the nearest to deciding
     periods: int | None  # in all, that would decide where it is undecided
     predicted: float | None = None  # of the design plant
+    state: str = ""  # of the machine whose limit and prediction these are: "stuck", by dry friction
     near: float | None = None  # where those periods last over an hour: the estimate's distance from the limit, relative
 
 

@@ -63,7 +63,14 @@ class Response:
     at_amplitude_only: bool  # dry friction, and the gain is another one at another amplitude, or was seen at one only
     needs_phases: bool  # dry friction, and fewer than six sets of phases
     needs_lines: tuple[float, float] | None = None  # Hz, from where to where lines are to lie, where they do not
+    effort: float | None = None  # with dry friction: the most by which the effort swings about its middle in the logs
+    friction: float | None = None  # which dry friction takes: below it the motor does not move
     rate: float = 1.0  # of the law, over what the clock of the logs says: Hz and seconds are those of the machine
+
+    @property
+    def still(self) -> bool:
+        """Whether dry friction held the motor in all logs."""
+        return self.effort is not None and self.friction is not None and self.effort <= self.friction
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
@@ -75,6 +82,9 @@ class Response:
             "needs_phases": self.needs_phases,
             "needs_lines_hz": self.needs_lines,
             "rate": self.rate,
+            "friction": None
+            if self.friction is None
+            else {"dry": self.friction, "effort": self.effort, "moves": not self.still},
             "measured": [_describe_lines(part, 1.0 - self.confidence) for part in self.measured],
         }
 
@@ -122,10 +132,15 @@ def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured
 
 def has_dry_friction(controller: Controller) -> bool:
     """Tell whether the design plant has dry friction at its values."""
+    return find_friction(controller) > 0.0
+
+
+def find_friction(controller: Controller) -> float:
+    """Return the effort at the spring that the design plant's dry friction takes at its values."""
     if controller.design is None:
-        return False
+        return 0.0
     plant, values = controller.design
-    return any(find_dry_friction(plant, plant.complete(values)).values())
+    return sum(find_dry_friction(plant, plant.complete(values)).values())
 
 
 def judge_response(controller: Controller, groups: Sequence[Blocks], confidence: float, rate: float = 1.0) -> Response:
@@ -358,7 +373,8 @@ def _judge_discs(name: str, asked: float | None, measured: Sequence[Measured], a
 
 def _judge_bandwidth(controller: Controller, measured: Sequence[Measured], alpha: float) -> Judged:
     """Judge whether the tracking stays above -3 dB up to the bandwidth that was asked for, less its share."""
-    limit = (1.0 - SHORT_BY) * _find_least_bandwidth(controller)
+    least, stuck = _find_least_bandwidth(controller)
+    limit = (1.0 - SHORT_BY) * least
     tracked = controller.achieved.bandwidth_hz is not None and controller.achieved.bandwidth_hz < 1e6
     m, bound = sum(part.f.size for part in measured), _bound_tracking(controller)
     values, lows, highs = list[float](), list[float](), list[float]()
@@ -378,22 +394,24 @@ def _judge_bandwidth(controller: Controller, measured: Sequence[Measured], alpha
         room = np.maximum(np.abs(middle - HALF_POWER), 1e-300)
         needed = max(needed, float(np.max(((middle - lower) / room)[open_], initial=0.0)) ** 2 * part.periods)
     outcome = _decide(confirmed, refuted)
-    high = min(highs)
+    high, predicted = min(highs), least if stuck else controller.achieved.bandwidth_hz
     return Judged(
-        name="bandwidth", limit=limit if tracked else None, sense="at least", value=min(values), low=min(lows),
+        name="bandwidth", state="stuck" if stuck else "",
+        limit=limit if tracked else None, sense="at least", value=min(values), low=min(lows),
         high=high if math.isfinite(high) else None, unit="Hz", outcome=outcome, where_hz=where,
-        periods=_count_periods(outcome, needed), predicted=controller.achieved.bandwidth_hz if tracked else None,
+        periods=_count_periods(outcome, needed), predicted=predicted if tracked else None,
     )  # fmt: skip
 
 
-def _find_least_bandwidth(controller: Controller) -> float:
+def _find_least_bandwidth(controller: Controller) -> tuple[float, bool]:
     """Return the bandwidth that was asked for; with dry friction no more than that of the plant that is stuck, which a
-    small amplitude comes near.
+    small amplitude comes near; and whether it is that.
     """
     asked = controller.spec.bandwidth_hz
     if not has_dry_friction(controller):
-        return asked
-    return min([asked, *(each.bandwidth_hz for each in controller.measure_states().values() if each.bandwidth_hz)])
+        return asked, False
+    least = min([asked, *(each.bandwidth_hz for each in controller.measure_states().values() if each.bandwidth_hz)])
+    return least, least < (1.0 - SHORT_BY) * asked
 
 
 def _find_fall(f: Float[np.ndarray, " m"], size: Float[np.ndarray, " m"]) -> float:
