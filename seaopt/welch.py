@@ -7,7 +7,7 @@ counts on it (Parseval's 3/8, the mean of three lines that an H1 estimate is). T
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -42,15 +42,10 @@ def count_averages(segments: int) -> float:
 def transform(
     segments: Float[np.ndarray, "*shape n"], window: Float[np.ndarray, " n"]
 ) -> Complex[np.ndarray, "*shape m"]:
-    """Return the spectra of windowed segments without their means, in their own precision; the segments are used up."""
+    """Return the spectra of windowed segments without their means; the segments are used up."""
     segments -= segments.mean(axis=-1, keepdims=True)
     segments *= window  # in place: fresh memory costs more than the transform
-    if segments.dtype == np.float64:
-        return np.fft.rfft(segments)
-    from scipy.fft import rfft  # deferred: scipy is slow to load, and of single precision twice as fast
-
-    spectra: Any = rfft(segments)
-    return spectra
+    return np.fft.rfft(segments)
 
 
 def square(values: Complex[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:

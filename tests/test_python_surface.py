@@ -70,6 +70,21 @@ def test_no_name_loads_what_takes_half_a_second():
     assert found.stdout.strip() == "[]"
 
 
+def test_a_judged_fit_does_without_scipy():
+    """Which takes longer to load than such a fit takes."""
+    code = (
+        "import sys, numpy as np, seaopt as so\n"
+        "from seaopt.bench import PAPER_STAND, Sensors, virtual_log\n"
+        "plant, truth = so.plants.high_impedance(), so.plants.thor()\n"
+        "log = virtual_log(plant, truth, PAPER_STAND, duration_s=6, rate_hz=400, seed=1,\n"
+        "                  sensors=Sensors(noise_std={'F1': 2.0, 'F2': 2.0}))\n"
+        "experiment = so.Experiment(plant=plant, log=log, outputs=('F1', 'F2'))\n"
+        "print(so.fit([experiment], truth.update(J=2e-6).free('J', 'b_r')).met, 'scipy' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["True", "False"]
+
+
 def test_the_fit_says_what_it_found(named):
     fit = named.fit
     assert fit.met and fit.status == "converged" and fit.identifiability.rank == 3

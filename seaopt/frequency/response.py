@@ -110,9 +110,8 @@ def responses(
     period: float,
     *,
     stretch_s: float | None = None,
-    rough: bool = False,
 ) -> list[FrequencyResponse]:
-    """Return `h1` from u to several outputs, the spectra of u made once; rough ones in single precision."""
+    """Return `h1` from u to several outputs, the spectra of u made once."""
     n = u.size
     if stretch_s is not None and not 0.0 < stretch_s < n * period:
         raise LogError(f"stretch_s = {stretch_s:g} is not within the log of {n * period:g} s; give a shorter one")
@@ -123,17 +122,13 @@ def responses(
     if np.ptp(u) == 0.0:
         raise LogError("the input is constant; a frequency response needs excitation")
     starts = welch.list_starts([slice(0, n)], length)
-    window, scale = welch.hann(length), [1.0] * (1 + len(outputs))
-    if rough:
-        scale = [float(np.ptp(channel)) or 1.0 for channel in (u, *outputs)]
-        window = window.astype(np.float32)
-        u, *outputs = (((x - x[0]) / size).astype(np.float32) for x, size in zip((u, *outputs), scale, strict=True))
+    window = welch.hann(length)
     suu, syy = np.zeros(length // 2), np.zeros((len(outputs), length // 2))
     suy = np.zeros(syy.shape, dtype=complex)
     # Long logs are looked at in the memory of a batch.
     for batch in np.array_split(starts, -(-len(starts) * length // BATCH)):
         uf, *spectra = (
-            welch.transform(np.stack([x[start : start + length] for start in batch], dtype=window.dtype), window)[:, 1:]
+            welch.transform(np.stack([x[start : start + length] for start in batch]), window)[:, 1:]
             for x in (u, *outputs)
         )
         suu += _power(uf) / len(starts)
@@ -145,11 +140,11 @@ def responses(
     return [
         FrequencyResponse(
             frequency_hz=frequency,
-            response=cross / np.maximum(suu, 1e-300) * (size / scale[0]),
+            response=cross / np.maximum(suu, 1e-300),
             coherence=welch.coherence(cross, suu, power),
             averages=len(starts),
         )
-        for cross, power, size in zip(suy, syy, scale[1:], strict=True)
+        for cross, power in zip(suy, syy, strict=True)
     ]
 
 
@@ -199,5 +194,5 @@ def conditioned_responses(
 
 
 def _power(spectra: Complex[np.ndarray, "d m"]) -> Lines:
-    parts = spectra.view(np.real(spectra).dtype)  # real and imaginary, side by side
+    parts = spectra.view(float)  # real and imaginary, side by side
     return np.sum(np.einsum("dm,dm->m", parts, parts).reshape(-1, 2), axis=1)

@@ -22,6 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from seaopt import welch
+from seaopt.estimation.problem.chance import exceeds
+from seaopt.estimation.problem.correlation import find_quick_size_within
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.estimation.result.model_error import bridge
@@ -50,8 +52,6 @@ class CoherentShare:
 
 def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals) -> dict[str, CoherentShare]:
     """Return what the inputs account for, by output; empty where the log is too short to tell, or nothing moves."""
-    from scipy.fft import prev_fast_len  # deferred: scipy is slow to load
-
     inputs, outputs = _gather(experiment, residuals)
     shares: dict[str, CoherentShare] = {}
     if not inputs:
@@ -59,7 +59,7 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
     total = sum(len(rows) for rows in inputs)
     # Even, for stretches overlap by half, and without a prime factor above 5, for transforms are quick then.
     longest = (min(max(2 * total // count, SHORTEST), total) for count in STRETCHES)
-    lengths = sorted({2 * (prev_fast_len(samples // 2, real=True) or 0) for samples in longest})
+    lengths = sorted({2 * find_quick_size_within(samples // 2) for samples in longest})
     spectra = [
         spectrum for length in lengths if (spectrum := _make_spectra(inputs, outputs, length, experiment)) is not None
     ]
@@ -138,14 +138,13 @@ class _Spectra:
 
     def _test(self, s: int, trials: int) -> tuple[float, tuple[float, float]]:
         """Return the least p of the octaves, and its octave."""
-        from scipy.special import digamma, gammaincc, polygamma  # deferred: scipy is slow to load
-
-        f, k, m = self.frequency_hz, self.averages, float(self.inputs)
+        f = self.frequency_hz
         gamma2 = np.clip(self.coherent[:, s] / np.maximum(self.power[:, s], 1e-300), 0.0, 1.0 - 1e-12)
         gamma2[self.power[:, s] <= 1e-20 * np.sum(self.power[:, s])] = 0.0
         statistic = -np.log1p(-gamma2)
-        mean = float(digamma(k) - digamma(k - m))
-        variance = float(polygamma(1, k - m) - polygamma(1, k))
+        # Of one line: the sums that differences of the digamma and the trigamma functions are, of a whole number apart.
+        terms = 1.0 / (self.averages - 1.0 - np.arange(self.inputs))
+        mean, variance = float(np.sum(terms)), float(np.sum(terms**2))
         octave = np.floor(np.log2(f[-1] / f)).astype(int)
         best, band, numbers = 1.0, (float(f[0]), float(f[-1])), np.unique(octave)[:OCTAVES]
         for number in numbers:
@@ -153,7 +152,7 @@ class _Spectra:
             # Neighbouring lines of a Hann window share two thirds of their amplitude: two lines tell as much as one.
             n = max(0.5 * np.count_nonzero(rows), 1.0)
             shape, scale = n * mean**2 / variance, variance / mean
-            p = float(gammaincc(shape, n * float(np.mean(statistic[rows])) / scale))
+            p = exceeds(shape, n * float(np.mean(statistic[rows])) / scale)
             if p < best:
                 best, band = p, (float(f[rows][0]), float(f[rows][-1]))
         return min(best * numbers.size * trials, 1.0), band

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.estimation.judgement.missing_force import find_missing_force
-from seaopt.estimation.problem.correlation import load_fft
+from seaopt.estimation.problem.correlation import find_quick_size
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.estimation.problem.shapes import Vector
@@ -62,7 +62,7 @@ def find_ripple(
     moved = np.abs(np.gradient(position))
     if not np.ptp(position) or not np.all(size > 0.0):
         return {}
-    residual = load_fft().rfft(raw / size[:, None])
+    residual = np.fft.rfft(raw / size[:, None])
     gain = _respond(experiment.data.plant, params, experiment.data.outputs, experiment.period, position.size)
     nearby = min(NEARBY, residual.shape[1])
     own = np.stack([np.convolve(row, np.full(nearby, 1.0 / nearby), "same") for row in np.abs(residual) ** 2])
@@ -71,7 +71,7 @@ def find_ripple(
 
     def weigh(wave: float) -> Weight:
         slow = moved * wave < 2.0 * np.pi * TURNS
-        turned = load_fft().rfft(np.stack([np.sin(wave * position), np.cos(wave * position)]) * slow)
+        turned = np.fft.rfft(np.stack([np.sin(wave * position), np.cos(wave * position)]) * slow)
         columns = gain[:, None, :] * turned
         gram = np.sum(np.real(columns[:, :, None, :] * np.conj(columns[:, None, :, :])), axis=(0, 3))
         right = np.sum(np.real(columns * np.conj(residual[:, None, :])), axis=(0, 2))
@@ -80,7 +80,7 @@ def find_ripple(
         share = 1.0 - np.sum(np.abs(rest) ** 2, axis=1) / np.sum(np.abs(residual) ** 2, axis=1)
         return float(np.max(share)), position.size, float(amplitudes[0]), float(amplitudes[1])
 
-    force = load_fft().irfft(np.sum(np.conj(gain) * residual, axis=0), position.size)
+    force = np.fft.irfft(np.sum(np.conj(gain) * residual, axis=0), position.size)
     return _search_waves(position, force, moved, weigh)
 
 
@@ -145,11 +145,11 @@ def _list_waves(
     """Return the wave numbers at which a force repeats most over the positions, some of each octave up to the top."""
     grid = 2.0 * np.pi / (PLACES * top)
     place = ((position - position.min()) / grid).astype(int)
-    size = load_fft().next_fast_len(int(np.ceil(2.0 * np.pi / (step * grid))), real=True)
+    size = find_quick_size(int(np.ceil(2.0 * np.pi / (step * grid))))
     waves, chosen, high = 2.0 * np.pi / (size * grid) * np.arange(size // 2 + 1), list[float](), top
     while high > 2.0 * step:
         slow = moved * high < 2.0 * np.pi * TURNS
-        power = np.abs(load_fft().rfft(np.bincount(place, force * slow, size)))
+        power = np.abs(np.fft.rfft(np.bincount(place, force * slow, size)))
         there = np.flatnonzero((waves > max(0.5 * high, 2.0 * step)) & (waves <= high))
         chosen += waves[there[np.argsort(power[there])[-TRIED:]]].tolist()
         high *= 0.5

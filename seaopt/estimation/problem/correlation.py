@@ -13,11 +13,13 @@ logged late.
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from functools import cache, reduce
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from seaopt.estimation.problem.chance import exceeds
 from seaopt.estimation.problem.shapes import Parts, Signal
 from seaopt.records import record
 
@@ -52,43 +54,49 @@ class CrossCorrelation:
         return self.worst > 1.0
 
 
-def load_fft() -> Any:
-    """Return SciPy's Fourier transforms."""
-    from scipy import fft  # deferred: scipy is slow to load
+@cache
+def _list_quick() -> Int[np.ndarray, " sizes"]:
+    """Return the numbers without a prime factor above 5: transforms of such lengths are quick."""
+    powers = (base ** np.arange(count) for base, count in ((2.0, 31), (3.0, 20), (5.0, 14)))
+    sizes = reduce(np.multiply.outer, powers).ravel()
+    return np.sort(sizes[sizes < 2.0**31]).astype(int)
 
-    return fft
+
+def find_quick_size(samples: int) -> int:
+    """Return the least length of quick transforms of so many samples or more."""
+    return int(_list_quick()[np.searchsorted(_list_quick(), samples)])
 
 
-def choose_transform_size(samples: int, lags: int) -> int:
-    """Return a length at which transforms of so many samples give their products at so many lags, and are quick."""
-    return int(load_fft().next_fast_len(samples + lags, real=True))
+def find_quick_size_within(samples: int) -> int:
+    """Return the largest length of quick transforms of so many samples or fewer."""
+    return int(_list_quick()[np.searchsorted(_list_quick(), samples, side="right") - 1])
 
 
 class LaggedSums:
     """Sums over t of x_a(t) x_b(t - k), k = 0..lags, of parts of at most `longest` samples, added one by one."""
 
     def __init__(self, rows: int, longest: int, lags: int) -> None:
-        self.lags, self.size = lags, choose_transform_size(longest, lags)
+        self.lags, self.size = lags, find_quick_size(longest + lags)
         lines = self.size // 2 + 1
         self.own = np.zeros((rows, 2 * lines))  # squares of real and imaginary parts, side by side
         self.cross = {(a, b): np.zeros(lines, dtype=complex) for a in range(rows) for b in range(a)}
 
     def add(self, x: Float[np.ndarray, "rows n"]) -> None:
         """Add a part."""
-        spectrum = load_fft().rfft(x, self.size)
+        spectrum = np.fft.rfft(x, self.size)
         self.own += np.square(spectrum.view(float))
         for (a, b), total in self.cross.items():
             total += spectrum[a] * np.conj(spectrum[b])
 
     def sums(self) -> Float[np.ndarray, "lags1 rows rows"]:
         """Return the sums by lag."""
-        irfft, rows, count = load_fft().irfft, len(self.own), self.lags + 1
+        rows, count = len(self.own), self.lags + 1
         sums = np.empty((count, rows, rows))
         power = np.sum(self.own.reshape(rows, -1, 2), axis=2)
-        for a, auto in enumerate(irfft(power, self.size)):
+        for a, auto in enumerate(np.fft.irfft(power, self.size)):
             sums[:, a, a] = auto[:count]
         for (a, b), total in self.cross.items():
-            both = irfft(total, self.size)
+            both = np.fft.irfft(total, self.size)
             sums[:, a, b] = both[:count]
             sums[0, b, a], sums[1:, b, a] = both[0], both[:-count:-1]
         return sums
@@ -102,17 +110,15 @@ def parzen(reach: int) -> Float[np.ndarray, " reach1"]:
 
 def autocorrelation(r: Signal, lags: int) -> Float[np.ndarray, " lags1"]:
     """Return the autocorrelation of a residual at lags 0 to `lags`; zero where there is no power."""
-    fft, size = load_fft(), choose_transform_size(len(r), lags + 1)
+    size = find_quick_size(len(r) + lags + 1)
     used = r != 0.0
     centred = np.where(used, r - (r[used].mean() if np.any(used) else 0.0), 0.0)
-    sums = fft.irfft(np.abs(fft.rfft(centred, size)) ** 2, size)[: lags + 1]
+    sums = np.fft.irfft(np.abs(np.fft.rfft(centred, size)) ** 2, size)[: lags + 1]
     return sums / sums[0] if sums[0] > 0.0 else np.zeros(lags + 1)
 
 
 def cross_correlation(residuals: Parts, inputs: Parts, lags: int = INPUT_LAGS) -> CrossCorrelation | None:
     """Return the correlation of a residual with an input (zero residuals do not count); None if either is still."""
-    from scipy.special import erfc  # deferred: scipy is slow to load
-
     used = [r != 0.0 for r in residuals]
     count = sum(int(np.sum(mask)) for mask in used)
     if count < 2 * lags:
@@ -138,20 +144,18 @@ def cross_correlation(residuals: Parts, inputs: Parts, lags: int = INPUT_LAGS) -
         lags=np.arange(-lags, lags + 1.0),
         values=cross / size,
         bound=QUANTILE * deviation / size,
-        p=min(cross.size * float(erfc(worst / np.sqrt(2.0))), 1.0),
+        p=min(cross.size * math.erfc(worst / math.sqrt(2.0)), 1.0),
     )
 
 
 def _products(a: Signal, b: Signal, lags: int) -> Float[np.ndarray, " m"]:
     """Return the sums over t of a(t) b(t - k), k = -lags..lags."""
-    fft, size = load_fft(), choose_transform_size(len(a), lags + 1)
-    whole = fft.irfft(fft.rfft(a, size) * np.conj(fft.rfft(b, size)), size)
+    size = find_quick_size(len(a) + lags + 1)
+    whole = np.fft.irfft(np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size)), size)
     return np.concatenate([whole[-lags:], whole[: lags + 1]]) if lags else whole[:1]
 
 
 def ljung_box(rho: Float[np.ndarray, " lags"], n: float) -> float:
     """Return the p-value of the Ljung-Box test (1978) that correlations at lags 1, 2, ... of n samples are chance."""
-    from scipy.special import gammaincc  # deferred: scipy.stats takes a second
-
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, rho.size + 1))))
-    return float(gammaincc(rho.size / 2, statistic / 2))
+    return exceeds(rho.size / 2, statistic / 2)

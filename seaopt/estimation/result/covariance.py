@@ -31,7 +31,7 @@ from jaxtyping import Bool, Complex, Float
 
 from seaopt.codec import NullIs
 from seaopt.errors import EstimationError
-from seaopt.estimation.problem.correlation import choose_transform_size, load_fft, parzen
+from seaopt.estimation.problem.correlation import find_quick_size, parzen
 from seaopt.estimation.problem.fit_experiment import CACHED_SAMPLES, FitExperiment, FitSegment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import add_gram
@@ -200,11 +200,11 @@ class _DoubleSum:
     @classmethod
     def make(cls, r: Float[np.ndarray, "lags1 ny ny"], n: int) -> _DoubleSum:
         """Return the form for at most n samples."""
-        reach, size = len(r) - 1, choose_transform_size(n, len(r))
+        reach, size = len(r) - 1, find_quick_size(n + len(r))
         kernel = np.zeros((*r.shape[1:], size))
         kernel[:, :, : reach + 1] = r.transpose(1, 2, 0)
         kernel[:, :, size - reach :] = r[:0:-1].transpose(2, 1, 0)  # R(-k) = R(k)'
-        density = load_fft().rfft(kernel) * (2.0 / size)
+        density = np.fft.rfft(kernel) * (2.0 / size)
         density[:, :, 0] *= 0.5
         if size % 2 == 0:
             density[:, :, -1] *= 0.5
@@ -215,7 +215,7 @@ class _DoubleSum:
         ny, p, n = a.shape
         if not n:
             return np.zeros((p, p))
-        spectrum = load_fft().rfft(a, self.size)
+        spectrum = np.fft.rfft(a, self.size)
         density, total = self.density[:, :, None], np.zeros((p, p))
         for o in range(ny):
             filtered: Complex[np.ndarray, "p f"] = np.zeros_like(spectrum[o])

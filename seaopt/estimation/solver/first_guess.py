@@ -90,7 +90,7 @@ def _measure_targets(experiment: FitExperiment, params: ParameterSet, theta: Par
     measured, stretch_s = [log[data.outputs[o]] for o in whole], _choose_window(len(log)) * log.period
     try:
         if len(active) == 1:
-            estimated = [responses(log[active[0]], measured, log.period, stretch_s=stretch_s, rough=True)]
+            estimated = [responses(log[active[0]], measured, log.period, stretch_s=stretch_s)]
         else:
             estimated = conditioned_responses([log[n] for n in active], measured, log.period, stretch_s=stretch_s)
     except LogError:
