@@ -40,6 +40,7 @@ ROUNDING_DECREMENT = 1e-4  # squared standard deviations that rounding may leave
 UNSEEN = 1e-14  # of the largest eigenvalue; directions below it are left where they are
 ROUNDING_RADIUS = 1e-15  # of the size of the point
 FLAT_STEPS = 6  # in a row that leave the cost as it is
+LOST_STEPS, GAIN = 8, 1e-3  # steps to where the cost is not finite, since it last fell by such a share of itself
 NEAR_ENOUGH = 0.25  # squared standard deviations that the slope leaves where the cost is flat
 STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a few times that over the step to come
 
@@ -63,6 +64,7 @@ class Solution(Generic[M]):
     message: str
     iterations: int
     before: float = 0.0
+    lost: bool = False  # where steps beyond, to the end, could not be simulated
 
 
 def minimise(
@@ -97,7 +99,7 @@ def minimise(
         return Solution(z=current.z, evaluation=current, status="stalled", message=message, iterations=0)
     scale = _column_norms(current)
     radius = first_radius * max(float(np.linalg.norm(scale * current.z)), 1.0)
-    unchanged = 0
+    unchanged, lost, best = 0, 0, current.cost
     for iteration in range(1, max_iterations + 2):  # after the last step convergence is tested once more
         blocked = find_blocked(current, low, high)
         distance = current.distance_squared(~blocked)
@@ -120,6 +122,11 @@ def minimise(
                 status="converged" if distance <= NEAR_ENOUGH else "stalled",
                 iterations=iteration - 1,
                 message=f"the cost is flat, and {np.sqrt(distance):.1g} standard deviations are left by its slope",
+            )
+        if lost >= LOST_STEPS:
+            message = "the search goes where the plant cannot be simulated; start closer, or give bounds"
+            return Solution(
+                z=current.z, evaluation=current, status="stalled", message=message, iterations=iteration - 1, lost=True
             )
         change, damping = _step(current, blocked, scale, radius)
         end = np.clip(current.z + change, low, high)
@@ -153,6 +160,9 @@ def minimise(
         predicted = -float(current.gradient @ moved + 0.5 * moved @ current.hessian @ moved)
         trial = objective.evaluate(end)
         ratio = (current.cost - trial.cost) / predicted if predicted > 0.0 and np.isfinite(trial.cost) else -1.0
+        lost += not np.isfinite(trial.cost)
+        if trial.cost < (1.0 - GAIN) * best:
+            lost, best = 0, trial.cost
         unchanged = unchanged + 1 if flat > 0.0 and abs(trial.cost - current.cost) <= flat * current.cost else 0
         if ratio < 0.25:
             radius = 0.25 * min(radius, length) if length > 0.0 else 0.25 * radius

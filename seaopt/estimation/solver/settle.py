@@ -169,7 +169,8 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
             flat=flat,
         )
         evaluation, iterations = solution.evaluation, iterations + solution.iterations
-        if not np.isfinite(evaluation.cost):
+        lost = solution.lost and explains_little(problem, evaluation.power)
+        if lost or not np.isfinite(evaluation.cost):
             solution = replace(solution, iterations=iterations)
             return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
         sigma = estimate_sigma(problem, evaluation.power, evaluation.z)

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 import seaopt as so
 from seaopt.estimation.problem.correlation import LaggedSums
 from seaopt.estimation.problem.normal_equations import QuadraticModel
-from seaopt.estimation.solver.least_squares import minimise
+from seaopt.estimation.solver.least_squares import LOST_STEPS, minimise
 from seaopt.simulation import Clock, Point, Segment, Weights, double_sum, keep_passes, make_model, run_passes, stream
 from seaopt.simulation.compiled import PARALLEL, Program
 from seaopt.simulation.interpreted import interpret_pass
@@ -190,3 +190,30 @@ def test_a_last_step_is_followed_without_an_evaluation_and_ends_where_scipy_does
     near = 1.01 * all_made.evaluation.cost
     ended = minimise(Exponential(), start, -bounds, bounds, ends=lambda here: here.cost < near)
     assert ended.evaluation.cost < near and ended.iterations < all_made.iterations
+
+
+class Wall:
+    """A parabola about `least`, which no run reaches below `wall`."""
+
+    def __init__(self, least, wall):
+        self.least, self.wall, self.calls = least, wall, []
+
+    def evaluate(self, z):
+        self.calls.append(float(z[0]))
+        apart = z - self.least
+        cost = 0.5 * float(apart @ apart) + 1e3 if z[0] > self.wall else np.inf
+        return QuadraticModel(z=z, cost=cost, gradient=apart, hessian=np.eye(1), linear=np.zeros(1, dtype=bool))
+
+
+def test_a_search_ends_where_it_goes_to_what_cannot_be_simulated():
+    bounds, start = np.full(1, np.inf), np.array([1.0])
+    beyond = Wall(-0.5, 0.0)
+    solution = minimise(beyond, start, -bounds, bounds)
+    assert solution.lost and solution.status == "stalled"
+    assert "cannot be simulated" in solution.message
+    assert 0.0 < solution.z[0] < 0.5
+    assert sum(z <= 0.0 for z in beyond.calls) == LOST_STEPS
+    near = Wall(0.01, 0.0)  # a search that comes to its minimum beside the wall is not lost
+    solution = minimise(near, start, -bounds, bounds)
+    assert solution.status == "converged" and not solution.lost
+    assert solution.z[0] == pytest.approx(0.01, abs=1e-6)
