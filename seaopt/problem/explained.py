@@ -29,15 +29,20 @@ def say_unexplained(trials: Sequence[HypothesisTrial]) -> str:
     """Return in words why nothing was added to a problem whose fit tried these."""
     if not trials:
         return "nothing was tried: no residual asks for more than the model has, or it explains too little"
-    as_good = [trial for trial in trials if trial.outcome != "tried"]
+    as_good = [trial for trial in trials if trial.outcome in ("adopted", "tied")]
     if as_good:
         effects = "; or ".join(f"{trial.effect} ({', '.join(trial.parts)})" for trial in as_good)
         return f"nothing is added, for several causes explain the logs: {effects}; add the one you expect"
-    best, count = min(trials, key=lambda trial: trial.excess), len(trials)
+    decided = [trial for trial in trials if trial.outcome != "undecided"]
+    left = [trial.effect for trial in trials if trial.outcome == "undecided"]
+    stiff = f"; not decided, as it takes too many integration steps, is whether {'; or '.join(left)}" if left else ""
+    if not decided:
+        return f"nothing explains the logs{stiff}"
+    best, count = min(decided, key=lambda trial: trial.excess), len(decided)
     return (
         f"nothing explains the logs: of {count} causes and pairs that were tried the best, {best.effect}, leaves "
         f"{best.excess:.3g} times the sensor's noise of {best.excess_before:.3g}; look for what is not among them, "
-        "such as a bench that shakes, another load, or a wrong unit"
+        f"such as a bench that shakes, another load, or a wrong unit{stiff}"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from dataclasses import replace
 
@@ -69,6 +70,13 @@ def test_what_nothing_explains_is_said():
     assert "the best, the motor cogs, leaves 12 times the sensor's noise of 30" in say_unexplained(trials)
     tied = tuple(replace(each, outcome="tied") for each in trials)
     assert "the spring hardens (hardening); or the motor cogs" in say_unexplained(tied)
+    left = replace(trials[0], outcome="undecided", excess=math.inf)
+    said = say_unexplained((trials[1], left))
+    assert (
+        "of 1 causes" in said
+        and f"not decided, as it takes too many integration steps, is whether {left.effect}" in said
+    )
+    assert say_unexplained((left,)).startswith("nothing explains the logs; not decided")
 
 
 def test_what_leaves_a_large_residual_is_not_called_explained():

@@ -14,13 +14,14 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
+from seaopt.estimation.judgement.budget import Budget
 from seaopt.estimation.judgement.candidates import Candidate, list_candidates
 from seaopt.estimation.judgement.hypothesis_search import Refit
 from seaopt.estimation.judgement.score_test import ScoreTest
 from seaopt.estimation.judgement.second_log import FAR
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import measure_spread
-from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, pose_problem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
@@ -77,14 +78,14 @@ def find_causes(
     poor: bool,
     noticed: bool = True,
     hypotheses: Sequence[Refit] = (),
-    budget: float = np.inf,
+    budget: Budget | None = None,
     progress: Progress = ignore,
 ) -> list[Cause]:
     """Return what explains the logs better than the fit, the best first. `fit`: with its minimum; `residuals`: of the
     fit; `suspects`: what was fixed and is at odds with the logs; `alternatives`: other plants that may have been on the
     bench; `poor`: whether the fit explains so little that its estimates are no start: what searches does so from its
     own; `noticed`: whether anything is wrong besides the suspects; `hypotheses`: those that remove the excess;
-    `budget`: evaluations after which nothing more is tried; `progress`: called before each that is tried.
+    `budget`: after which nothing more is tried; `progress`: called before each that is tried.
     """
     minimum = fit.require_minimum("find_causes")
     fitted = minimum.problem.evaluate(minimum.z)
@@ -98,9 +99,8 @@ def find_causes(
     causes: list[Cause] = []
     candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor, noticed=noticed))
     causes += _weigh_hypotheses(fit, hypotheses, whole, colour)
-    begun = count_evaluations()
     for number, candidate in enumerate(candidates, start=1):
-        spent = (count_evaluations() - begun) / budget
+        spent = 0.0 if budget is None else budget.share
         if spent >= 1.0:
             break
         progress(f"trying cause {number} of {len(candidates)}", max(spent, (number - 1) / len(candidates)))
@@ -256,9 +256,11 @@ def _weigh(
     *,
     poor: bool,
 ) -> Cause | None:
-    """Return what a refit is worth; None where chance gives as much, or where it is no other explanation."""
+    """Return what a refit is worth; None where chance gives as much, where it is no other explanation, or where its
+    slopes do not tell how well its values are known.
+    """
     after = _measure_powers(evaluation, problem)
-    if len(after) != len(before):
+    if len(after) != len(before) or not np.all(np.isfinite(evaluation.hessian)):  # slopes of a run that overflows
         return None
     fall = np.log(before[:, 0]) - np.log(after[:, 0])
     gain = 0.5 * float(np.sum(before[:, 1] * fall)) / colour

@@ -9,7 +9,8 @@ best three are joined with each other, and then with every other one, two in all
 a pair often gets on where its parts got stuck, so that either is then tried alone from there; and beside one that would
 be taken alone it has to remove all of the excess that is left.
 
-What this may cost is counted in evaluations of the problem, so that the same log has the same answer on any machine.
+What this may cost is counted (`budget`). A refit that asks for integration steps out of proportion to the fit's is left
+undecided: bristles that slip fast are so stiff, and their search often ends in no minimum.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import ParamSpec
 import numpy as np
 
 from seaopt.errors import SeaoptError
+from seaopt.estimation.judgement.budget import Budget
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Change, Hypothesis, change_plants, measure_sizes
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
@@ -34,7 +36,7 @@ from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_stic
 from seaopt.estimation.solver.least_squares import FIRST_RADIUS, find_blocked, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
 from seaopt.estimation.solver.step_shares import copy_steps
-from seaopt.estimation.solver.step_size import choose_first_steps, hold_bristles, refine_bristles
+from seaopt.estimation.solver.step_size import choose_first_steps, has_bristles, hold_bristles, refine_bristles
 from seaopt.parameters import ParameterSet
 from seaopt.progress import Progress, ignore
 from seaopt.records import record
@@ -69,6 +71,7 @@ class Refit:
     excess: float
     gain: float  # logarithm of its likelihood over the fit's
     evaluations: int
+    undecided: bool = False  # whether it was left because its steps were out of proportion
 
     @property
     def values(self) -> dict[str, float]:
@@ -136,30 +139,29 @@ def search_hypotheses(
     fit: Fit,
     residuals: ResidualsByExperiment,
     floors: Mapping[str, NoiseFloor],
-    budget: int,
+    budget: Budget,
     progress: Progress = ignore,
     *,
     doubtful: bool = False,
 ) -> Search:
     """Return the hypotheses that were tried, the best first; none where the residual asks for none.
 
-    `fit`: with its minimum, `residuals`, `floors`: there; `budget`: evaluations that the search may take; `doubtful`:
-    whether values hang on little of the residual, so that what is hardly more than noise asks, too.
+    `fit`: with its minimum, `residuals`, `floors`: there; `budget`: what the search may take; `doubtful`: whether
+    values hang on little of the residual, so that what is hardly more than noise asks, too.
     """
     minimum = fit.require_minimum("search_hypotheses")
     first = _find_excess(minimum.problem, residuals, floors)
     if (first <= ASKS and not doubtful) or minimum.problem.predicts:
         return Search()
-    end = count_evaluations() + budget
-    refits = _Search(fit, minimum, first, end, budget, progress).run()
+    refits = _Search(fit, minimum, first, budget, progress).run()
     return _judge(refits, first, measure_colour(fit.covariance, fit.white_covariance))
 
 
 class _Search:
     """A search's budget, and what it knows of the fit; lives only inside `search_hypotheses`."""
 
-    def __init__(self, fit: Fit, minimum: Minimum, first: float, end: int, budget: int, progress: Progress) -> None:
-        self.fit, self.minimum, self.end, self.budget, self.progress = fit, minimum, end, budget, progress
+    def __init__(self, fit: Fit, minimum: Minimum, first: float, budget: Budget, progress: Progress) -> None:
+        self.fit, self.minimum, self.budget, self.progress = fit, minimum, budget, progress
         self.first, self.helps = first, HELPS * (1.0 - max(first, 1.0) ** -2)
         self.sizes = measure_sizes(fit)
         # Which no refit tells from other values; but far from the logs sensitivities say little.
@@ -173,9 +175,10 @@ class _Search:
         if self.first > REMOVED:
             problem, fitted = coarsen(problem, self.minimum.z)
         single = list(self.try_each(problem, fitted, self.fit.experiments, self.fit.parameters))
-        single.sort(key=lambda refit: refit.excess)
-        refits = sorted([*map(self.go_on, single[:BASES]), *single[BASES:]], key=lambda refit: refit.excess)
-        bases = refits[:BASES]
+        single.sort(key=lambda refit: (refit.undecided, refit.excess))
+        gone_on = [*map(self.go_on, single[:BASES]), *single[BASES:]]
+        refits = sorted(gone_on, key=lambda refit: (refit.undecided, refit.excess))
+        bases = [refit for refit in refits[:BASES] if not refit.undecided]
         partners = [refit.change.hypotheses[-1] for refit in bases]
         # The best with each other first: of two effects either alone may take little.
         rounds = [(best, partners[number:]) for number, best in enumerate(bases[:-1], start=1)]
@@ -187,19 +190,20 @@ class _Search:
             refits += self.try_each(
                 best.problem, best.evaluation, best.change.experiments, values, best.change, done, others
             )
-        if not refits:
+        decided = [refit for refit in refits if not refit.undecided]
+        if not decided:
             return refits
         # Near noise likelihoods tell apart what hardly differs in excess.
-        best = min(refits, key=lambda refit: refit.excess if self.first > ASKS else -refit.gain)
+        best = min(decided, key=lambda refit: refit.excess if self.first > ASKS else -refit.gain)
         settled = _settle(best, best.evaluation)
         return _keep_best([*(refit for refit in refits if refit is not best), settled, *self.try_alone(settled)])
 
     def go_on(self, refit: Refit) -> Refit:
         """Return a refit that has helped and was left before its minimum after as many rounds again."""
-        if refit.at_minimum or refit.excess > (1.0 - self.helps) * self.first:
+        if refit.undecided or refit.at_minimum or refit.excess > (1.0 - self.helps) * self.first:
             return refit
         start = refit.evaluation
-        further = _descend(refit.change, refit.problem, start, self.base, self.base, self.helps, self.end)
+        further = _descend(refit.change, refit.problem, start, self.base, self.base, self.helps, self.budget)
         return replace(further, evaluations=refit.evaluations + further.evaluations) if further else refit
 
     def try_alone(self, pair: Refit) -> Iterator[Refit]:
@@ -207,7 +211,7 @@ class _Search:
         for hypothesis in pair.change.hypotheses if len(pair.change.hypotheses) > 1 else ():
             change = change_plants(hypothesis, self.fit.experiments, self.fit.parameters, self.sizes)
             assert change is not None  # it is in a pair
-            refit = _refit_alone(change, pair, self.helps, self.base)
+            refit = _refit_alone(change, pair, self.helps, self.base, self.budget)
             if refit is not None:
                 yield refit
 
@@ -225,14 +229,13 @@ class _Search:
         for hypothesis in hypotheses:
             if hypothesis.part in self.silent or (before is not None and {*before.hypotheses, hypothesis} in done):
                 continue
-            left = self.end - count_evaluations()
-            if left <= 0:
+            if self.budget.left <= 0.0:
                 return
             change = change_plants(hypothesis, experiments, params, self.sizes, before)
             if change is None:
                 continue
-            self.progress(f"trying cause: {hypothesis.effect}", min(1.0 - left / self.budget, 1.0))
-            refit = _refit(change, problem, fitted, self.helps, self.base, self.end)
+            self.progress(f"trying cause: {hypothesis.effect}", self.budget.share)
+            refit = _refit(change, problem, fitted, self.helps, self.base, self.budget)
             if refit is not None:
                 yield refit
 
@@ -265,29 +268,31 @@ def _or_none(refit: Callable[P, Refit | None]) -> Callable[P, Refit | None]:
 
 @_or_none
 def _refit(
-    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, end: int
+    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, budget: Budget
 ) -> Refit | None:
     """Return the minimum with a change, from the fit's, `base` the fit without any; None where it cannot be simulated.
 
     A search that takes less than `helps` of the residual's power in a round of iterations is given up, and so is one
-    that has come to `end`, a count of evaluations.
+    that has come to the end of the budget.
     """
     before = count_evaluations()
     problem = _pose(change, old)
     begins = _begin_segments(problem, old, fitted.z)
-    problem, start = _choose_start(change, problem, {**begins, **old.unknowns.by_name(fitted.z)})
-    refit = _descend(change, _rest(problem, start, old), start, fitted, base, helps, end)
+    values = {**begins, **old.unknowns.by_name(fitted.z)}
+    problem, start = _choose_start(change, problem, values, fitted, budget)
+    refit = _descend(change, _rest(problem, start, old), start, fitted, base, helps, budget)
     return refit and replace(refit, evaluations=count_evaluations() - before)
 
 
 @_or_none
-def _refit_alone(change: Change, pair: Refit, helps: float, base: Evaluation) -> Refit | None:
+def _refit_alone(change: Change, pair: Refit, helps: float, base: Evaluation, budget: Budget) -> Refit | None:
     """Return the minimum with one part of a pair, from the pair's values, as `_refit` does; whatever is left of the
     budget, for a pair is not believed without.
     """
     problem = _pose(change, pair.problem)
     start = problem.evaluate(problem.unknowns.start_from(pair.values))
-    return _descend(change, problem, start, base, base, helps, count_evaluations() + ROUNDS * ROUND)
+    budget = Budget.begin(ROUNDS * ROUND, max(budget.unit, problem.count_work(start.z)))
+    return _descend(change, problem, start, base, base, helps, budget)
 
 
 def _pose(change: Change, old: FitProblem) -> FitProblem:
@@ -305,16 +310,20 @@ def _descend(
     fitted: Evaluation,
     base: Evaluation,
     helps: float,
-    end: int,
+    budget: Budget,
 ) -> Refit | None:
     """Return the minimum that rounds of iterations come to from a start, as `_refit` does."""
-    if not np.isfinite(start.cost):
-        return None
     before = count_evaluations()
+    if not np.isfinite(start.cost):
+        left = Refit(change=change, problem=problem, evaluation=start, excess=np.inf, gain=-np.inf, evaluations=0)
+        return replace(left, undecided=True) if has_bristles(problem) else None
     evaluation, unknowns, powers = start, problem.unknowns, _measure_powers(start)
     at_fit = least = checked = _measure_powers(fitted)
-    radius = FIRST_RADIUS
+    radius, undecided = FIRST_RADIUS, False
     for number in range(MOST_ROUNDS):
+        undecided = not budget.allows(problem, evaluation.z)
+        if undecided:
+            break
         # The smaller the residual has become, the finer must be the steps.
         if np.any(powers < HALF * checked):
             problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS, roughly=True)
@@ -326,8 +335,12 @@ def _descend(
             problem, first, low, high, decrement=near, max_iterations=ROUND, first_radius=radius, callback=points.append
         )
         evaluation = solution.evaluation
-        if points[-2:] == [evaluation] * 2:  # no better: stiffer bristles may ask for shorter steps
-            problem = refine_bristles(problem, evaluation.z)
+        if points[-2:] == [evaluation] * 2 and has_bristles(problem):  # stiffer ones may ask for shorter steps
+            finer = refine_bristles(problem, evaluation.z)
+            undecided = finer is problem or not budget.allows(finer, evaluation.z)
+            if undecided:
+                break
+            problem = finer
         if evaluation is first and solution.status == "max_iterations" and radius == FIRST_RADIUS:
             radius = CLOSE  # every step went too far
             continue
@@ -342,17 +355,22 @@ def _descend(
             break
         if number >= ROUNDS - 1 and not np.any(powers < HALF * before_round):
             break
-        if count_evaluations() >= end:
+        if budget.left <= 0.0:
             break
         least = np.minimum(least, powers)
-    excess = _measure_excess(problem, evaluation.z)
-    gain = _measure_gain(base, evaluation)
+    refit = _weigh(change, problem, evaluation, base)
+    return replace(refit, undecided=undecided and refit.excess > REMOVED, evaluations=count_evaluations() - before)
+
+
+def _weigh(change: Change, problem: FitProblem, evaluation: Evaluation, base: Evaluation) -> Refit:
+    """Return the refit that a search has come to; near noise likelihoods are compared, for which steps are finer."""
+    excess, gain = _measure_excess(problem, evaluation.z), _measure_gain(base, evaluation)
     refit = Refit(change=change, problem=problem, evaluation=evaluation, excess=excess, gain=gain, evaluations=0)
-    if excess <= REMOVED:  # likelihoods near noise are compared, for which steps are finer
+    if excess <= REMOVED:
         problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS)
         if problem is not refit.problem:
             refit = _settle(replace(refit, problem=problem), evaluation)
-    return replace(refit, evaluations=count_evaluations() - before)
+    return refit
 
 
 def _settle(refit: Refit, start: Evaluation) -> Refit:
@@ -366,9 +384,12 @@ def _settle(refit: Refit, start: Evaluation) -> Refit:
     return replace(refit, evaluation=evaluation, excess=excess, gain=gain)
 
 
-def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float]) -> tuple[FitProblem, Evaluation]:
+def _choose_start(
+    change: Change, problem: FitProblem, fitted: dict[str, float], at_fit: Evaluation, budget: Budget
+) -> tuple[FitProblem, Evaluation]:
     """Return the evaluation at the fit's values and the best start of what is added, with steps that hold there: that
     from which a step of all else is to gain the most, for what a fit has in place of an effect is at odds with most.
+    Its cost is infinite where such steps would be out of proportion.
     """
     unknowns, starts = problem.unknowns, list[tuple[FitProblem, Evaluation]]()
     delays = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
@@ -379,9 +400,12 @@ def _choose_start(change: Change, problem: FitProblem, fitted: dict[str, float])
         z[delays] -= hypothesis.lag(start)
         z[stiffnesses] -= hypothesis.stiffens(change.sizes, start)
         z = np.clip(z, unknowns.low, unknowns.high)
+        if not budget.allows(problem, z):
+            starts.append((problem, replace(at_fit, z=z, cost=np.inf)))
+            continue
         evaluation, stable = problem.evaluate(z), problem
         if not np.isfinite(evaluation.cost):
-            stable = hold_bristles(problem, z)
+            stable = hold_bristles(problem, z, lambda finer, z=z: budget.allows(finer, z))
             evaluation = stable.evaluate(z) if stable is not problem else evaluation
         starts.append((stable, evaluation))
     others = np.array([name in fitted for name in unknowns.names])
@@ -478,7 +502,7 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
     """Return what became of each hypothesis, the best first: of those as good the one with the fewest unknowns.
     `first`, `colour`: of the fit, its excess and how many times more than for white residuals its estimates vary.
     """
-    single = [refit for refit in refits if len(refit.change.hypotheses) == 1]
+    single = [refit for refit in refits if len(refit.change.hypotheses) == 1 and not refit.undecided]
     best_single = min((refit.excess for refit in single), default=np.inf)
     # Two effects are taken where one leaves an excess, and the other takes half of that; where one would do, all of it.
     most = max(REMOVED, NEARLY * first)
@@ -487,6 +511,7 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
         refit
         for refit in refits
         if refit.excess <= most
+        and not refit.undecided
         and (_takes_half(first, refit.excess) if first > ASKS else refit.gain > CHANCE * colour)
         and (refit in single or (refit.excess <= most_of_pair < best_single and _takes_half(best_single, refit.excess)))
     ]
@@ -496,8 +521,10 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
         best = max(refit.gain for refit in tied)
         tied = [refit for refit in tied if refit.gain >= best - CHANCE * colour]
     tied.sort(key=lambda refit: (refit.evaluation.z.size, refit.excess))
-    others = sorted((refit for refit in refits if refit not in tied), key=lambda refit: refit.excess)
-    outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]], *["tried" for _ in others]]
+    others = [refit for refit in refits if refit not in tied]
+    others.sort(key=lambda refit: (refit.undecided, refit.excess))
+    outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]]]
+    outcomes += ["undecided" if refit.undecided else "tried" for refit in others]
     ranked = [*tied, *others]
     trials = tuple(_state(refit, outcome, first) for refit, outcome in zip(ranked, outcomes, strict=True))
     return Search(able=tuple(tied), trials=trials, partial=None if able else find_partial(refits, first, colour))

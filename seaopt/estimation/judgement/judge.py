@@ -19,6 +19,7 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.estimation.judgement.another_start import find_other_minimum
+from seaopt.estimation.judgement.budget import EVALUATIONS, Budget
 from seaopt.estimation.judgement.candidates import free_delay
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
@@ -28,7 +29,6 @@ from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, r
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
 from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
-from seaopt.estimation.problem.fit_problem import count_evaluations
 from seaopt.estimation.problem.noise_floor import measure_floors
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
@@ -41,7 +41,6 @@ from seaopt.progress import Progress, divide, ignore
 from seaopt.simulation import depends_on_time
 from seaopt.units import unit_after
 
-EVALUATIONS = 40  # of a fit, at least: one of a linear plant that starts well takes a few
 OF_HYPOTHESES, OF_CAUSES = 3, 2  # times those, that refits of hypotheses and of other causes may take
 TESTS, CAUSES = 1.0, float(OF_HYPOTHESES + OF_CAUSES)  # times the search, that a judgement may take
 HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
@@ -81,7 +80,7 @@ def judge(
     `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
     not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's;
     `evaluations`: what the fit took, of which the search for causes may take about five times as many, and five times
-    `EVALUATIONS` where it took fewer: each of the hypotheses takes several, however soon the fit was there.
+    `EVALUATIONS` where it took fewer (see `budget`).
     """
     minimum = fit.require_minimum("judge")
     testing, trying = divide(progress, TESTS, CAUSES)
@@ -121,19 +120,16 @@ def judge(
     wrong = noticed or bool(suspects)
     little = any(finding.kind == "explained" for finding in findings)
     refitting = divide(trying, OF_HYPOTHESES, OF_CAUSES)[0]
-    evaluations, begun = max(evaluations, EVALUATIONS), count_evaluations()
+    unit = minimum.problem.count_work(minimum.z)
+    evaluations = max(evaluations, EVALUATIONS)
+    looking = Budget.begin(OF_HYPOTHESES * evaluations, unit)
     doubtful = _hangs_on_little(fit, findings)
-    search = (
-        Search()
-        if little
-        else search_hypotheses(fit, residuals, floors, OF_HYPOTHESES * evaluations, refitting, doubtful=doubtful)
-    )
+    search = Search() if little else search_hypotheses(fit, residuals, floors, looking, refitting, doubtful=doubtful)
     if search.partial is not None:
         fit, findings = _reach(fit, findings, error, search.partial)
     if wrong or search.able:
-        spent = count_evaluations() - begun
         # A search of hypotheses that takes more than its share leaves the other causes theirs.
-        budget = max((OF_HYPOTHESES + OF_CAUSES) * evaluations - spent, OF_CAUSES * evaluations)
+        budget = Budget.begin(OF_CAUSES * evaluations + max(looking.left, 0.0), unit)
         causes = find_causes(
             fit,
             residuals,
@@ -143,7 +139,7 @@ def judge(
             noticed=noticed,
             hypotheses=search.able,
             budget=budget,
-            progress=divide(trying, spent, budget)[1],
+            progress=divide(trying, looking.spent, budget.evaluations)[1],
         )
         named = list(_name_causes(fit, causes, suspects))
         told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)

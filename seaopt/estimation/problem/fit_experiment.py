@@ -144,6 +144,16 @@ class FitExperiment:
         """Return the integration steps per sample: more than asked for where fewer would be unstable."""
         return max(self.substeps, self.count_least_steps(z))
 
+    def count_all_steps(self, z: Vector) -> int:
+        """Return the integration steps of all samples; a linear plant takes one in each."""
+        if self.model.linear:
+            return self.samples
+        point = self.point(z)
+        return sum(
+            s.samples.n * point.most_steps if s.samples.shares is None else int(np.sum(point.count_steps(s.samples)))
+            for s in self.segments
+        )
+
     def count_least_steps(self, z: Vector) -> int:
         """Return the integration steps per sample that are stable, or 1 where those are too many."""
         stable = self.count_stable_steps(z)
@@ -171,7 +181,7 @@ class FitExperiment:
                 delay_s=slots.delay.at(z),
                 delay_free=slots.delay.index is not None,
             ),
-            substeps=self.substeps,
+            substeps=1 if self.is_too_stiff(z) else self.substeps,  # its cost is infinite, whatever it would be
             stable=self.count_least_steps(z),
             halved=self.halved,
         )

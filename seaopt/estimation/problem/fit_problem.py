@@ -53,6 +53,7 @@ ALONE = 8_000  # samples below which experiments are not worth a thread each
 
 T = TypeVar("T")
 _evaluations: ContextVar[int] = ContextVar("evaluations", default=0)
+_work: ContextVar[int] = ContextVar("work", default=0)
 
 
 @record(eq=False)
@@ -142,9 +143,14 @@ class FitProblem:
     def evaluate(self, z: Vector) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""
         _evaluations.set(_evaluations.get() + 1)
+        _work.set(_work.get() + self.count_work(z))
         passes = self.map(lambda experiment: (experiment.name, experiment.run_all(z)))
         evaluation = self.assemble(PassSet(z=z, by_experiment=dict(passes)))
         return replace(evaluation, cost=np.inf) if any(e.is_too_stiff(z) for e in self.experiments) else evaluation
+
+    def count_work(self, z: Vector) -> int:
+        """Return what an evaluation at z takes: its integration steps, and one for the residual of each sample."""
+        return sum(experiment.samples + experiment.count_all_steps(z) for experiment in self.experiments)
 
     @property
     def shared_names(self) -> tuple[str, ...]:
@@ -246,6 +252,11 @@ class FitProblem:
 def count_evaluations() -> int:
     """Return how often problems have been evaluated here, which is what searches are counted in, not in seconds."""
     return _evaluations.get()
+
+
+def count_work() -> int:
+    """Return what these evaluations took, in integration steps (`FitProblem.count_work`)."""
+    return _work.get()
 
 
 def pose_problem(

@@ -8,7 +8,7 @@ from typing import Literal
 from seaopt.codec import OrInfinite
 from seaopt.records import record
 
-Outcome = Literal["adopted", "tied", "tried"]
+Outcome = Literal["adopted", "tied", "tried", "undecided"]
 
 
 def state_sticking(parts: Iterable[str]) -> list[str]:
@@ -27,10 +27,12 @@ class HypothesisTrial:
     parts : tuple of str
         The parts that bring it, `seaopt.plants.PARTS`.
     outcome : str
-        "adopted": it removes the excess, and nothing explains the logs better; "tied": it removes it as well; else
-        "tried".
+        "adopted": it removes the excess, and nothing explains the logs better; "tied": it removes it as well; "tried":
+        it does not; "undecided": its refit was left before its minimum, for an evaluation would take more than 20 times
+        as many integration steps as the fit's, or more than can be made in a sample.
     excess_before, excess : float
-        How many times its sensor's noise the residual is, of the output where it is most: of the fit, and with it.
+        How many times its sensor's noise the residual is, of the output where it is most: of the fit, and with it;
+        infinite where nothing was simulated.
     frees, fixed : mapping of name to value
         The parts' parameters: what the refit gave, in SI units, and what was chosen for it.
     parameters : mapping of name to value

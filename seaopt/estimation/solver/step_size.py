@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -89,11 +89,19 @@ def _choose_first_steps(experiment: FitExperiment, evaluation: Evaluation, most:
     return min(_choose_steps(experiment.count_steps(z), StepError(output=error), allowed, experiment), most)
 
 
-def hold_bristles(problem: FitProblem, z: Vector) -> FitProblem:
+def has_bristles(problem: FitProblem) -> bool:
+    """Tell whether some plant's friction bends before it slips."""
+    return any(remembers(experiment.data.plant) for experiment in problem.experiments)
+
+
+def hold_bristles(
+    problem: FitProblem, z: Vector, within: Callable[[FitProblem], bool] = lambda finer: True
+) -> FitProblem:
     """Return the problem with steps short enough for bristles at z, which are stiff where they slip. How fast they slip
     only a simulation tells: with steps too long for it that overflows, or makes a cost that half as long ones change.
+    `within`: tells of a problem whether its steps are not too many.
     """
-    if not any(remembers(experiment.data.plant) for experiment in problem.experiments):
+    if not has_bristles(problem):
         return problem
     cost = np.nan
     while True:
@@ -101,7 +109,7 @@ def hold_bristles(problem: FitProblem, z: Vector) -> FitProblem:
         if np.isfinite(new_cost) and abs(new_cost - cost) <= SAME_COST * new_cost:
             return problem
         finer = refine_bristles(problem, z)
-        if finer is problem:
+        if finer is problem or not within(finer):
             return problem
         problem, cost = finer, new_cost
 

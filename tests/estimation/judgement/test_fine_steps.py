@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.estimation.judgement import causes
+from seaopt.estimation.judgement import causes, hypothesis_search
+from seaopt.estimation.judgement.budget import EVALUATIONS, OUT_OF_PROPORTION
+from seaopt.estimation.judgement.candidates import Candidate
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Sizes, change_plants
+from seaopt.estimation.judgement.judge import OF_HYPOTHESES
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.solver.settle import refine_to
 from tests.actuator_logs import integrate
 
@@ -77,3 +81,57 @@ def test_a_pole_goes_no_farther_than_a_log_shows(log):
         hypothesis, (slow,), params, sizes
     )  # of one sample a second: 60 Hz is not to be started from
     assert change.params["current_loop_hz"].value == change.params["current_loop_hz"].max == pytest.approx(2.0)
+
+
+def test_what_takes_steps_out_of_proportion_is_not_decided(log, monkeypatch):
+    """Bristles that slip as fast as this motor turns: stiff, and not what the fit lacks."""
+    experiment, params = pose(log)
+    evaluate, works = FitProblem.evaluate, []
+
+    def count(problem, z):
+        if "sigma_0" in problem.shared_names:
+            works.append(problem.count_work(z))
+        return evaluate(problem, z)
+
+    monkeypatch.setattr(FitProblem, "evaluate", count)
+    fit = so.fit([experiment], params)
+    minimum = fit.require_minimum("")
+    unit, steps = minimum.problem.count_work(minimum.z), minimum.problem.experiments[0].substeps
+    assert unit == round(SECONDS * RATE_HZ) * (1 + steps)
+    (trial,) = (each for each in fit.hypotheses if each.parts == ("lugre",))
+    assert trial.outcome == "undecided"
+    assert len(works) >= trial.evaluations > 0
+    assert 8 * unit < max(works) <= OUT_OF_PROPORTION * unit
+    assert fit.hypotheses[-1] is trial
+    assert all(each.outcome != "undecided" for each in fit.hypotheses[:-1])
+    assert so.Fit.from_dict(fit.to_dict(), ()).hypotheses == fit.hypotheses
+
+
+def test_each_hypothesis_can_be_looked_at_in_the_least_budget():
+    sizes = Sizes(
+        current=1.0, speed=1.0, travel=1.0, friction=1.0, deflection=1.0, stiffness=1.0, ripple={"a_g": 1.0, "n_g": 1.0}
+    )
+    starts = sum(len(hypothesis.starts(sizes)) for hypothesis in HYPOTHESES)
+    assert starts + hypothesis_search.ROUND * (len(HYPOTHESES) + 2) <= OF_HYPOTHESES * EVALUATIONS
+
+
+def test_a_refit_whose_slopes_overflow_is_worth_nothing(log):
+    experiment, params = pose(log)
+    fit = so.fit([experiment], params, diagnostics=False)
+    minimum = fit.require_minimum("")
+    better = minimum.problem.evaluate(minimum.z)
+    power = {name: replace(each, squares=each.squares / 4.0) for name, each in better.power.items()}
+    better = replace(better, power=power)
+    candidate = Candidate(
+        where="v_s", experiments=fit.experiments, params=fit.parameters, says="v_s", frees={"J_m": 0.0}
+    )
+
+    def weigh(evaluation):
+        before = causes._measure_powers(minimum.problem.evaluate(minimum.z), minimum.problem)
+        return causes._weigh(fit, candidate, minimum.problem, evaluation, before, 1.0, poor=False)
+
+    assert weigh(better) is not None
+    for value in (np.nan, np.inf):
+        hessian = better.hessian.copy()
+        hessian[0, 1] = hessian[1, 0] = value
+        assert weigh(replace(better, hessian=hessian)) is None
