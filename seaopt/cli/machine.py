@@ -96,7 +96,7 @@ def accept_logs(
             others=_find_others(folder, path, controller),
             uncertainty=session.parameters(),
             ranges=take_ranges(controller, session.problem.ranges),
-            played=_find_played(folder, stage),
+            played=_find_played(folder, stage, path),
         )
     content = write(result, session, logs)
     again = write_again(result, session)
@@ -135,14 +135,18 @@ def _show(
     return content["met"]
 
 
-def _find_played(folder: Path, stage: str | None) -> Played | None:
-    """Return how long the reference of a stage is, by the bring-up of a folder; None where it has no such stage."""
+def _find_played(folder: Path, stage: str | None, path: Path) -> Played | None:
+    """Return how long the reference of a stage is, by the bring-up of a folder; None where it has no such stage, or one
+    of another law than that of `path`, from before it was tuned again.
+    """
+    name = stage or FULL
     try:
         stages = read_json(folder / BRING_UP / PLAN, BRINGUP_SCHEMA)["stages"]
+        planned, judged = (read_json(each, SCHEMAS["tune"]) for each in (folder / BRING_UP / name / path.name, path))
     except SeaoptError:  # none was planned, or it was edited
         return None
-    found = next((each["reference"] for each in stages if each["name"] == (stage or FULL)), None)
-    if found is None:
+    found = next((each["reference"] for each in stages if each["name"] == name), None)
+    if found is None or planned.get("law") != judged.get("law"):
         return None
     periods = found["periods"] * found["phases"] + 2  # one that fades in, and one that fades out
     return Played(period_s=found["period_s"], lasts_s=periods * found["period_s"])

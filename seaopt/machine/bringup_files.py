@@ -51,7 +51,9 @@ double stage_reference(unsigned long tick)
 """
 
 
-def write_bring_up(plan: BringUp, folder: Path | str, *, tare: Tare | None = None) -> tuple[Path, ...]:
+def write_bring_up(
+    plan: BringUp, folder: Path | str, *, tare: Tare | None = None, fit_met: bool | None = None
+) -> tuple[Path, ...]:
     """Write a folder for each stage, and bringup.json beside them.
 
     Parameters
@@ -62,6 +64,9 @@ def write_bring_up(plan: BringUp, folder: Path | str, *, tare: Tare | None = Non
         Made if it does not exist.
     tare : Tare, optional
         Beside each law the C that averages the zero of the force at rest.
+    fit_met : bool, optional
+        Whether the fit that the laws were tuned with is met (`fit.met`), which bringup.json, each controller.json and
+        the C state; on one that is not, the bring-up is not met either.
 
     Returns
     -------
@@ -74,9 +79,10 @@ def write_bring_up(plan: BringUp, folder: Path | str, *, tare: Tare | None = Non
         The folder cannot be written.
     """
     target = Path(folder)
-    files = [write_json(target / "bringup.json", plan.to_dict())]
+    doubt = {} if fit_met is None else {"met": plan.met and fit_met, "fit_met": fit_met}
+    files = [write_json(target / "bringup.json", plan.to_dict() | doubt)]
     for stage in plan.stages:
-        files += write_stage(stage, target / stage.name, tare=tare)
+        files += write_stage(stage, target / stage.name, tare=tare, fit_met=fit_met)
     return tuple(files)
 
 

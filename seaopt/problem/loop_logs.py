@@ -9,7 +9,7 @@ from pathlib import Path
 from seaopt.errors import LogError
 from seaopt.logs import Column, Log, contents, read_log
 from seaopt.logs.formats import Field
-from seaopt.logs.quality.clock import JITTER_LIMIT, assess_clock, split_at_gaps
+from seaopt.logs.quality.clock import JITTER_LIMIT, assess_clock, shorten_rate, split_at_gaps
 from seaopt.logs.reading.selection import ClockError
 from seaopt.problem.bench_tables import ExperimentTable
 from seaopt.problem.columns import make_column
@@ -19,7 +19,6 @@ from seaopt.units import bare_name
 
 MOST_NAMES = 20  # in a message
 LONG_STEP = 3.0  # periods of a step that no jitter makes of one, of ticks that are stamped late
-SAME_RATE = 1e-3  # relative: a rate of few digits is meant, and stamps tell by how much it is off
 
 
 def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], reference: str | None = None) -> Log:
@@ -84,9 +83,7 @@ def _advise_rate(log: Log) -> str:
     """Return what to do about uneven stamps of ticks: their mean rate, where it explains them."""
     parts = split_at_gaps(log.time, LONG_STEP * log.period) or [slice(None)]
     stamps = max((log.time[part] for part in parts), key=len)
-    mean_hz = (stamps.size - 1) / float(stamps[-1] - stamps[0])
-    rates = [float(f"{mean_hz:.{digits}g}") for digits in range(2, 7)]
-    rate_hz = next(rate for rate in rates if abs(rate / mean_hz - 1.0) < SAME_RATE)
+    rate_hz = shorten_rate((stamps.size - 1) / float(stamps[-1] - stamps[0]))
     try:
         log.restamp(rate_hz=rate_hz)
     except LogError:

@@ -170,6 +170,20 @@ def test_a_stated_rate_is_nominal(ppm):
     assert ("than stated" in even.notes[-1]) == (ppm != 0.0)
 
 
+@pytest.mark.parametrize("share", [3e-3, 3e-2, 0.2])
+@pytest.mark.parametrize("ppm", [0.0, -300.0])
+def test_rows_that_are_lost_one_by_one_are_counted_whatever_their_share(share, ppm):
+    """Stamps that jitter by a fifth of a period to either side, and come late by more once in a thousand."""
+    rng = np.random.default_rng(8)
+    index = np.flatnonzero(np.append(rng.random(19_999) >= share, True))
+    true = index * 1e-3 * (1.0 + 1e-6 * ppm)
+    late = rng.uniform(-2e-4, 2e-4, index.size) + np.where(rng.random(index.size) < 1e-3, 1.4e-3, 0.0)
+    late[np.append(np.diff(index) > 1, False)] = 0.0  # a late one before a lost one may be either
+    stamps = np.maximum.accumulate(true + late) + 1e-12 * np.arange(index.size)
+    even = so.Log.from_arrays(time=stamps, F1=index.astype(float)).restamp(rate_hz=1000)
+    np.testing.assert_allclose(even.time - even.time[0], true - true[0], atol=1e-4)
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_matlab_4_files_are_read(tmp_path, order):
     rng = np.random.default_rng(2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.logs.quality.clock import assess_clock
+from seaopt.logs.quality.clock import assess_clock, shorten_rate
 
 
 def alternating(short, long, runs, count=1200, seed=0):
@@ -61,3 +61,10 @@ def test_stamps_rounded_to_nearly_a_period_are_no_gaps():
     log = so.Log.from_arrays(time=np.round(true, 3), F1=np.sin(true))
     assert log.rate_hz == pytest.approx(800.0, rel=1e-3) and log.gaps == []
     np.testing.assert_allclose(log.restamp().time, true, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "meant"), [(1000.4, 1000.0), (1021.59, 1022.0), (99.95, 100.0), (18432.6, 18430.0)]
+)
+def test_a_rate_is_advised_with_the_digits_that_it_takes(rate_hz, meant):
+    assert shorten_rate(rate_hz) == meant and abs(meant / rate_hz - 1.0) < 1e-3

@@ -86,6 +86,14 @@ def test_the_files_are_there_and_the_c_of_the_reference_is_the_table(plan, compi
     assert played[-1] == 0.0 and np.allclose(played[:-1], table, atol=1e-6 * np.max(np.abs(table)))
 
 
+@pytest.mark.parametrize("fit_met", [True, False, None])
+def test_the_files_state_whether_the_fit_is_met(plan, tmp_path, fit_met):
+    write_bring_up(plan, tmp_path, fit_met=fit_met)
+    content = json.loads((tmp_path / "bringup.json").read_text())
+    assert content.get("fit_met") is fit_met and content["met"] is (fit_met is not False)
+    assert json.loads((tmp_path / "full" / "controller.json").read_text()).get("fit_met") is fit_met
+
+
 def test_where_no_slower_law_is_certified_it_is_the_same_with_less_effort(controller):
     def refuse(fraction):
         raise so.SeaoptError("none")

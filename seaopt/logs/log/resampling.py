@@ -12,10 +12,17 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError, require_number, suggestion
 from seaopt.logs.log.alignment import Hold, Linear, Nearest, Readings, Rule
-from seaopt.logs.quality.clock import GAP, advise_clock, sample_rate_hz, split_at_gaps, timestamp_resolution
+from seaopt.logs.quality.clock import (
+    advise_clock,
+    sample_rate_hz,
+    shorten_rate,
+    split_at_gaps,
+    timestamp_resolution,
+)
 from seaopt.signals import Recording, VectorK, VectorM, VectorN
 
-AROUND = 20  # samples on either side of a long step that tell a gap from a late stamp
+AROUND = 20  # samples ahead that tell a gap from a late stamp
+PHASED = 50  # samples of a part that has one phase
 PARTS = 20  # of a log, whose medians tell the rate at which the timestamps run
 MOST_DRIFT = 5e-3  # of a stated rate, as of a ceramic resonator: a sampling clock that is further off has another rate
 RESOLVED = 5.0  # standard deviations of the drift's slope: less is jitter
@@ -54,7 +61,7 @@ def resample(
         raise LogError(f"{log.source}: bridge_s = {longest_s:g} is not a time; give seconds")
     if not 0.0 < rate_hz < np.inf:
         raise LogError(f"{log.source}: rate_hz = {rate_hz:g} is not positive; give the rate of the new clock")
-    round_rate = float(f"{old_rate_hz:.3g}")
+    round_rate = shorten_rate(old_rate_hz)
     if rate_hz < LEAST_RATE * old_rate_hz:
         every = max(round(old_rate_hz / rate_hz), 2)
         raise LogError(
@@ -173,24 +180,15 @@ def restamp(log: Recording, period: float, gap_s: float, rate_hz: float | None =
 
 def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[VectorN, str]:
     """Return a clock of a stated rate, with gaps of whole samples where the timestamps move on for good. A sample that
-    was stamped late is followed by a step that is too short: the timestamps come back to their line. At a gap they do
-    not: the median of the next `AROUND` samples lies above that of the ones before by whole periods. The stated rate is
-    nominal and says how samples are counted. Where the timestamps show by how much the sampling clock is off, as
-    crystals are, theirs is taken.
+    was stamped late is followed by steps that are too short: the timestamps come back to their line. At a gap they do
+    not. The stated rate is nominal and says how samples are counted. Where the timestamps show by how much the sampling
+    clock is off, as crystals are, theirs is taken.
     """
     time, period = log.time, 1.0 / rate_hz
-    steps = np.diff(time)
-    late, lost = np.append(0.0, steps - period), np.zeros(time.size)  # late: by how much more than the row before
-    rows = np.flatnonzero(steps > GAP * period) + 1
-    for row in rows[np.argsort(-steps[rows - 1], kind="stable")].tolist():  # a late sample beside a gap is none
-        first = max(row - AROUND, 0)
-        around = np.cumsum(late[first : row + AROUND])
-        after, before = around[row - first :], around[: row - first]
-        lost[row] = max(np.round((np.median(after) - np.median(before)) * rate_hz), 0.0)
-        late[row] -= period * lost[row]
-    line = period * (np.arange(time.size) + np.cumsum(lost))
+    lost = _count_lost((time - time[0]) * rate_hz - np.arange(time.size))
+    line = period * (np.arange(time.size) + lost)
     drift, left = _measure_drift(line, time - line)
-    round_rate = float(f"{sample_rate_hz(mean_period):.3g}")
+    round_rate = shorten_rate(sample_rate_hz(mean_period))
     if abs(drift) > MOST_DRIFT or left > 0.5 * period:  # a half, and samples would be counted wrongly
         raise LogError(
             f"{log.source}: rate_hz = {rate_hz:g} is not the rate of the timestamps, which drift from it by "
@@ -205,13 +203,28 @@ def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Vec
         clock = f"their clock of {rate_hz / (1.0 + drift):.9g} Hz, {1e6 * abs(drift):.3g} ppm {way} than stated"
     off = time - line
     off -= np.median(off)
-    gaps = int(np.count_nonzero(lost))
+    gaps = int(np.count_nonzero(np.diff(lost)))
     between = f" with {gaps} gap{'s' * (gaps != 1)} of whole samples" if gaps else ""
     note = (
         f"timestamps, off by {np.sqrt(np.mean(off**2)):.3g} s rms and {np.max(np.abs(off)):.3g} s at most, put on "
         f"{clock}{between}"
     )
     return line + np.median(time - line), note
+
+
+def _count_lost(late: VectorN) -> VectorN:
+    """Return how many samples are missing before each. `late`: by how many periods each is stamped later than its row
+    says. It is a whole number, a phase that drifts slowly, and jitter: the phase is the circular mean of parts, one
+    after another. What is stamped late comes back, what is missing never does: the least of those ahead counts.
+    """
+    parts = np.array_split(np.arange(late.size), max(late.size // PHASED, 1))
+    turns = np.array([np.angle(np.mean(np.exp(2j * np.pi * late[rows]))) for rows in parts])
+    middles = np.array([np.mean(rows) for rows in parts])
+    phase = np.interp(np.arange(late.size), middles, np.unwrap(turns) / (2.0 * np.pi))
+    whole = np.round(late - phase)
+    ahead = np.lib.stride_tricks.sliding_window_view(np.append(whole, np.full(AROUND, np.inf)), AROUND + 1)
+    least = np.maximum.accumulate(np.min(ahead, axis=1))
+    return least - least[0]
 
 
 def _measure_drift(line: VectorN, off: VectorN) -> tuple[float, float]:

@@ -17,6 +17,7 @@ LONG = 2.0  # times a step that is usual, where their lengths vary: what is long
 OFTEN = 0.05  # share of longer steps from which they are usual themselves
 WHOLE = 0.1  # of a period, off a whole number of them: a longer step is that of lost samples
 JITTER_LIMIT = 0.05  # of the period; beyond it a log is not uniformly sampled
+SAME_RATE = 1e-3  # relative: a rate of few digits that is nearer is meant
 ROUNDING_STEPS = 200_000  # steps of time that are enough to see the rounding of timestamps
 
 
@@ -56,11 +57,17 @@ def sample_rate_hz(period: float) -> float:
     return float(f"{1.0 / period:.9g}")
 
 
+def shorten_rate(rate_hz: float) -> float:
+    """Return a rate to the fewest digits that mean it: stamps tell themselves by how much a clock is off."""
+    rates = (float(f"{rate_hz:.{digits}g}") for digits in range(2, 9))
+    return next(each for each in rates if abs(each / rate_hz - 1.0) < SAME_RATE)
+
+
 def advise_clock(period: float, *, rounded: bool = False) -> tuple[str, list[dict[str, Any]]]:
     """Return how an uneven clock is made uniform, as calls and as keys; `rounded`: only its timestamps are."""
     if rounded:
         return "call log.restamp()", [{"resample": "restamp"}]
-    rate_hz = float(f"{1.0 / period:.3g}")
+    rate_hz = shorten_rate(1.0 / period)
     text = f"call log.resample(rate_hz={rate_hz:g}), or log.restamp(rate_hz={rate_hz:g}) where a PC stamped the "
     uniform = {"rate_hz": rate_hz}
     return text + "samples of a perfect clock", [{"resample": uniform}, {"resample": {**uniform, "rule": "restamp"}}]
