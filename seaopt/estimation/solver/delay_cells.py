@@ -4,6 +4,10 @@ An input that nearly repeats itself fits nearly as well a period late. A delay s
 that one simulation, held against the log at each whole sample of shift, tells where the cost is less; the search goes
 on from there, or from the delay of another log.
 
+A start that is a sample or more off may end in a minimum where other values make up for that, a servo's spring for
+the time that its firmware takes: where a shift of the start's own simulation leaves less than half of its cost, the
+search begins there.
+
 An output with feedthrough jumps with the input. With a held input the cost of a delay d is then smooth between whole
 samples only, in cells (m - 1, m] in which sample k - m is in force at sample k, and least squares ends in the cell in
 which it started, or goes to and fro across an end. Each neighbouring cell is searched too, from the end that is nearer,
@@ -21,6 +25,7 @@ import casadi as ca
 import numpy as np
 
 from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.least_squares import Callback, name_phase
@@ -29,6 +34,23 @@ from seaopt.estimation.solver.settle import Solved, settle
 FURTHEST = 100  # samples to either side
 INSIDE = 1e-6  # of a sample beyond a whole one: the next cell
 MOST_MOVES = 4  # cells that a delay may be carried on
+AT_START, HALF = 20, 0.5  # samples to either side, of a start; and of its cost, what a better delay leaves at most
+
+
+def shift_start(problem: FitProblem, start: Evaluation) -> Evaluation:
+    """Return a start with those free delays at which its simulation lies much nearer to the logs."""
+    for experiment in problem.experiments:
+        index = experiment.slots.delay.index
+        if index is None or not np.isfinite(start.cost):
+            continue
+        low, high = problem.unknowns.low[index], problem.unknowns.high[index]
+        shift = _find_best_shift(experiment, start.z, low, high, AT_START)
+        if shift:
+            z = start.z.copy()
+            z[index] += shift
+            shifted = problem.evaluate(z)
+            start = shifted if shifted.cost < HALF * start.cost else start
+    return start
 
 
 def search_delays(solved: Solved, max_iterations: int, callback: Callback | None = None) -> Solved:
@@ -56,10 +78,10 @@ def _search_further(solved: Solved, max_iterations: int, callback: Callback | No
     return solved
 
 
-def _find_best_shift(experiment: FitExperiment, z: Vector, low: float, high: float) -> float:
+def _find_best_shift(experiment: FitExperiment, z: Vector, low: float, high: float, most: int = FURTHEST) -> float:
     """Return by how many seconds, in whole samples, a simulation is to be shifted to lie nearest to the log."""
     period, delay = experiment.period, experiment.slots.delay.at(z)
-    reach = min(FURTHEST, experiment.longest // 4)
+    reach = min(most, experiment.longest // 4)
     shifts = [s for s in range(-reach, reach + 1) if low <= delay + s * period <= high]
     squares, counts = np.zeros(len(shifts)), np.zeros(len(shifts))
     residuals = compute_experiment_residuals(experiment, z)

@@ -14,6 +14,7 @@ from seaopt.estimation.problem.experiment import check_shots
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.shapes import Vector
+from seaopt.estimation.solver.delay_cells import shift_start
 from seaopt.estimation.solver.first_guess import guess_from_responses
 from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.loosening import loosen_start
@@ -236,7 +237,7 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
     guessed = problem.evaluate(guesses[0]) if guesses else None
     if guessed is not None and matched and not explains_little(problem, guessed.power):
         return guessed, guesses
-    first = problem.evaluate(problem.unknowns.start)
+    first = shift_start(problem, problem.evaluate(problem.unknowns.start))
     best = loosen_start(problem, first if guessed is None or guessed.cost > first.cost else guessed)
     if guesses and (matched or problem.all_linear) and explains_little(problem, best.power):
         # Of a linear plant the best initial states of shots follow from one evaluation.

@@ -43,7 +43,7 @@ def turn_servo(goal, steps=10):
     return out
 
 
-def fit_servo(start, duration_s, *, parts=(), late_s=1.0 / RATE_HZ, **known):
+def fit_servo(start, duration_s, *, parts=(), late_s=1.0 / RATE_HZ, free=(), diagnostics=True, **known):
     t = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
     goal = 0.15 * np.sin(2 * np.pi * (0.3 * t + 0.5 * 9.7 / 8.0 * t**2))
     log = so.Log.from_arrays(time=t, goal=goal, theta_m=turn_servo(goal))
@@ -51,7 +51,7 @@ def fit_servo(start, duration_s, *, parts=(), late_s=1.0 / RATE_HZ, **known):
     params = plant.defaults.with_parameters(so.Parameter(name="k_p", value=GAIN, unit="-")).update(**KNOWN, **known)
     delay = so.Parameter(name="delay", value=late_s, unit="s", free=True, max=0.05)
     bench = so.Experiment(plant=plant, log=log, outputs=("theta_m",), delay_s=delay, initial_state="rest")
-    return so.fit([bench], params.update(**start).free(*SERVO))
+    return so.fit([bench], params.update(**start).free(*SERVO, *free), diagnostics=diagnostics)
 
 
 def draw_start(truth, seed, factor):
@@ -133,3 +133,12 @@ def test_a_servo_whose_hold_is_given_has_its_elasticity():
     assert fit.derived["antiresonance_hz"].value == pytest.approx(11.94, rel=0.01)
     assert fit.outputs["experiment"]["theta_m"].rms_residual == pytest.approx(TICK / np.sqrt(12.0), rel=0.05)
     assert {finding.where for finding in fit.errors} == {"b_r"}  # known to 40 %
+
+
+@pytest.mark.parametrize("late_s", [0.005, 0.01])
+def test_a_delay_that_begins_samples_off_starts_where_the_log_has_it(late_s):
+    """Once: a spring of an eighth, and firmware that held for seven milliseconds, in place of a delay of none."""
+    fit = fit_servo(SERVO, 8.0, parts=["servo_hold"], late_s=late_s, free=["T_h"], diagnostics=False, T_h=HOLD_S)
+    assert fit.parameters["k_s"].value == pytest.approx(SERVO["k_s"], rel=0.06)
+    assert fit.parameters["T_h"].value == pytest.approx(HOLD_S, rel=0.2)
+    assert fit.nuisance["experiment"].fitted["delay_s"].value < 2e-4
