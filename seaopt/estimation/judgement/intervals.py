@@ -6,6 +6,7 @@ the values (`second_log`). It has to be narrow enough to design with, and the lo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -68,20 +69,27 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
     """Yield free parameters whose interval is wider than a design can use. One that may be zero, as a friction that a
     plant need not have, is known well enough where it hardly does anything; how large an effect is that a part brings
     does not have to be known, as long as the actuator's values do not depend on it.
+
+    How wide an interval is, is told over the value; over the hypotenuse of both where two are components of one size,
+    as cogging's sine and cosine are: where the encoder has its zero splits it between them, and may leave nothing to
+    one.
     """
     if fit.status != "converged":
         return
     plants = {experiment.plant.name: experiment.plant for experiment in fit.experiments}.values()
+    sizes = _measure_waves(fit)
     smoothing, rough = {name for plant in plants for name in list_smoothing(plant)}, list[str]()
     for name in fit.covariance.names:
         parameter = fit.parameters[name]
-        if parameter.known is None or parameter.known <= ROUGH or not parameter.identified or parameter.at_bound:
+        half = QUANTILE * (parameter.total_std or 0.0)
+        if parameter.known is None or not parameter.identified or parameter.at_bound:
+            continue
+        if half <= ROUGH * max(abs(parameter.value), sizes.get(name, 0.0)):
             continue
         if name in smoothing:  # a means of the simulation, no figure of the actuator
             continue
         defaults = (plant.parameters.get(name) for plant in plants)
         may_be_zero = any(isinstance(default, Parameter) and default.value == 0.0 for default in defaults)
-        half = QUANTILE * (parameter.total_std or 0.0)
         if not may_be_zero or half * error.effect[error.names.index(name)] > UNSEEN:
             rough.append(name)
     effects = _list_effects(fit) if rough else set[str]()  # makes plants anew
@@ -93,6 +101,13 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
             text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "
             "output, fix it, or give it a prior",
         )
+
+
+def _measure_waves(fit: Fit) -> dict[str, float]:
+    """Return the size of the wave that each of its components is part of."""
+    readings = [reading for e in fit.experiments for reading in e.plant.followed.values()]
+    pairs = [(name, reading.sizes) for reading in readings for name in reading.sizes]
+    return {name: math.hypot(*(fit.parameters[each].value for each in both)) for name, both in pairs}
 
 
 def find_step_error(fit: Fit) -> Iterator[FitFinding]:

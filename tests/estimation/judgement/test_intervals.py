@@ -12,8 +12,11 @@ from scipy.signal import lfilter
 import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.estimation import Fit, compare_with_log
-from seaopt.estimation.judgement.intervals import find_single_event, find_step_error
+from seaopt.estimation.judgement.intervals import find_rough, find_single_event, find_step_error
+from seaopt.estimation.result.model_error import ModelError
+from seaopt.estimation.result.widening import widen
 from seaopt.files import to_json
+from seaopt.parameters import QUANTILE
 
 N, PERIOD = 8000, 1e-3
 GAIN = so.Plant(
@@ -244,3 +247,25 @@ def test_friction_that_is_not_there_does_not_have_to_be_known(thor):
     result = so.fit([bench], values.update(J_m=2e-5, c_s=0.01).free("J_m", "b_r", "c_s"))
     assert result.parameters["c_s"].known > 0.2 or result.parameters["c_s"].at_bound
     assert "rough" not in list_kinds(result, "error")
+
+
+@pytest.mark.parametrize(("half", "severity"), [(0.15, None), (0.25, "rough")])
+def test_a_component_of_cogging_is_known_over_the_size_of_both(half, severity):
+    """Nearly all of it is in the sine: where the encoder has its zero."""
+    t, sizes = np.arange(1500) / 500.0, {"a_g": 2e-3, "b_g": 2e-5, "n_g": 7.0}
+    plant = so.plants.add_part(so.plants.rotary(link="locked"), "cogging")
+    truth = plant.defaults.update(f_c=0.004, v_s=1.0, **sizes)
+    current = 2.0 * np.sin(2 * np.pi * (0.5 * t + t**2))
+    run = so.simulate(plant, truth, so.Log.from_arrays(time=t, I=current))
+    noise = np.random.default_rng(2).normal(scale=1e-2, size=t.size)
+    log = so.Log.from_arrays(time=t, I=current, tau_s=run["tau_s"] + noise)
+    experiment = so.Experiment(plant=plant, log=log, outputs=("tau_s",))
+    fit = so.fit([experiment], truth.free("J_m", "a_g", "b_g"), diagnostics=False)
+    names = fit.covariance.names
+    value = fit.parameters["b_g"]
+    std = half * np.hypot(fit.parameters["a_g"].value, value.value) / QUANTILE
+    assert std > 3.0 * value.std and value.known > 0.2
+    matters = ModelError(names=names, excess={}, effect=np.full(len(names), 1e6))
+    wide = np.diag(np.square([std * (name == "b_g") for name in names]))
+    found = list(find_rough(widen(fit, wide), matters))
+    assert [(each.kind, each.where) for each in found] == ([(severity, "b_g")] if severity else [])
