@@ -16,6 +16,7 @@ from typing import Any
 
 from seaopt.errors import EstimationError, require_type
 from seaopt.estimation.judgement.judge import CAUSES, TESTS, judge
+from seaopt.estimation.judgement.score_test import free_fixed
 from seaopt.estimation.problem.experiment import Experiment, check_shots, is_constant
 from seaopt.estimation.problem.fit_experiment import MAX_SUBSTEPS, FitExperiment
 from seaopt.estimation.problem.fit_problem import FitProblem, count_evaluations, pose_problem
@@ -144,11 +145,13 @@ def fit(
             chosen.solve(hold_bristles(problem, problem.unknowns.start), callback), chosen.max_iterations, callback
         )
         evaluations = count_evaluations() - before
+        # Its passes serve all that follows.
+        freed = free_fixed(solved.problem, solved.solution.z) if diagnostics else None
         result = summarise(solved, chosen, diagnostics, started)
         if keep is not None:
             keep(replace(result, findings=order_findings((*result.findings, find_unjudged()))))
         if diagnostics:
-            judged = judge(result, alternatives, judging, validation, evaluations=evaluations)
+            judged = judge(result, alternatives, judging, validation, evaluations=evaluations, freed=freed)
             result = _name_guesses(judged, named, params)
     result = replace(result, validation=tuple(validation), holdout=holdout)
     if sharp:

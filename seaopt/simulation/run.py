@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from threading import Lock
-from typing import Any
+from typing import Any, TypeAlias
+
+import numpy as np
 
 from seaopt.signals import VectorX
 from seaopt.simulation.compiled import Program, double_sum_of_columns
@@ -19,6 +21,8 @@ from seaopt.simulation.passes import DoubleSum, Influence, Lagged, Pass, Point, 
 
 STREAM_SAMPLES = 1 << 16  # of a stream that are in memory at a time
 KEPT_BYTES = 1 << 26  # of the passes that are kept at a time
+
+Asked: TypeAlias = tuple[Model, Segment, Point, VectorX, Weights]  # of a pass: what is simulated, from which state
 
 
 class _Kept:
@@ -188,6 +192,24 @@ def _run_kept(kept: _Kept, program: Program, x0: VectorX, *, output_rows: int, c
     if run_up is None and result.sensitivity is not None:
         kept.keep_run_up(segment, find_run_up(result.sensitivity, segment.n))
     return result
+
+
+def keep_part(asked: Asked, larger: Asked, columns: Sequence[int]) -> None:
+    """Make the whole pass of a segment with more columns for whoever asks for it, and keep its part for who asks for
+    these columns alone. Both are simulated alike, of the same plant and samples; there has to be room (`measure_room`).
+    """
+    kept = _kept.get()
+    if kept is None:
+        return
+    model, segment, *_ = asked
+    run_up = kept.find_run_up(segment)
+    if run_up is not None:
+        kept.keep_run_up(larger[1], run_up)
+    whole = run_passes(*larger, outputs=True, columns=True, keep=True)
+    if whole.columns is not None:
+        rows = np.array(columns)
+        part = replace(whole, gram=whole.gram[:, rows[:, None], rows], columns=whole.columns[:, :, rows])
+        kept.add(_key(*asked), part, model, segment)
 
 
 def stream(

@@ -163,7 +163,7 @@ def diagnose(fit: Fit) -> Diagnostics:
         outputs=outputs,
         leverage=leverage,
         at_bound=at_bound,
-        held=run_score_tests(minimum, fit),
+        held=run_score_tests(minimum),
         aic=fit.aic,
         bic=fit.bic,
         findings=fit.findings,

@@ -14,7 +14,14 @@ from typing import Any, TypeVar
 import casadi as ca
 import numpy as np
 
-from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, free_more, run_score_tests
+from seaopt.estimation.judgement.score_test import (
+    Freed,
+    ScoreTest,
+    find_candidates,
+    free_delay,
+    free_more,
+    run_score_tests,
+)
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
@@ -103,10 +110,11 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
     """Yield the fixed parameters that are at odds with the logs, and those that would make a linear plant nonlinear.
     One of each group that acts alike, such as a screw's lead and its gear, is tried before the second of any.
     """
-    plain, bending = find_candidates(minimum.problem, fit)
+    plain, bending = find_candidates(minimum.problem)
     tests = dict(suspects)
     for name in bending[:MOST_BENDING]:
-        tests |= run_score_tests(minimum, fit, (name,)) if name not in tests else {}
+        if name not in tests:
+            tests |= run_score_tests(minimum, Freed.make(minimum.problem, minimum.z, (name,)))
     speeds = {name for e in fit.experiments for name in list_smoothing(e.plant)}
     groups = _group_alike({name: test for name, test in tests.items() if name in plain})
     in_turn = [name for rank in zip_longest(*groups) for name in rank if name is not None]
@@ -119,7 +127,7 @@ def _free_parameters(fit: Fit, minimum: Minimum, suspects: Mapping[str, ScoreTes
         yield Candidate(
             where=name,
             experiments=fit.experiments,
-            params=free_more(fit, (name,)).update(**{name: start}),
+            params=free_more(fit.parameters, (name,)).update(**{name: start}),
             says=partial(_state_value, parameter, name in speeds),
             frees={name: 0.0},
             smoothed=parameter if name in speeds else None,
@@ -271,11 +279,6 @@ def _take_output(experiment: Experiment, output: str) -> Experiment:
         saturation=pick(experiment.saturation),
         offset=pick(experiment.offset) if isinstance(experiment.offset, Mapping) else experiment.offset,
     )
-
-
-def free_delay(experiment: Experiment, value: float) -> Experiment:
-    """Return the experiment with a free delay that starts at a value."""
-    return replace(experiment, delay_s=Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0))
 
 
 def _lead(experiment: Experiment, samples: int) -> Experiment:

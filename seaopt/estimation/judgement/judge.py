@@ -20,12 +20,11 @@ import numpy as np
 
 from seaopt.estimation.judgement.another_start import find_other_minimum
 from seaopt.estimation.judgement.budget import EVALUATIONS, Budget
-from seaopt.estimation.judgement.candidates import free_delay
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.hypothesis_search import Search, search_hypotheses
 from seaopt.estimation.judgement.intervals import find_excesses, find_rough, find_single_event, find_step_error
-from seaopt.estimation.judgement.score_test import ScoreTest, find_candidates, run_score_tests
+from seaopt.estimation.judgement.score_test import Freed, ScoreTest, free_fixed, run_score_tests
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
 from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
@@ -38,7 +37,6 @@ from seaopt.formatting import join_words
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore
-from seaopt.simulation import depends_on_time
 from seaopt.units import unit_after
 
 OF_HYPOTHESES, OF_CAUSES = 3, 2  # times those, that refits of hypotheses and of other causes may take
@@ -74,13 +72,15 @@ def judge(
     validation: Sequence[Experiment] = (),
     *,
     evaluations: int = EVALUATIONS,
+    freed: Freed | None = None,
 ) -> Fit:
     """Return the fit with how much of its outputs is explained, and what is wrong with it.
 
     `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
     not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's;
     `evaluations`: what the fit took, of which the search for causes may take about five times as many, and five times
-    `EVALUATIONS` where it took fewer (see `budget`).
+    `EVALUATIONS` where it took fewer (see `budget`); `freed`: the minimum's problem with what was
+    fixed free, where that is at hand.
     """
     minimum = fit.require_minimum("judge")
     testing, trying = divide(progress, TESTS, CAUSES)
@@ -111,7 +111,7 @@ def judge(
         *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each))), minimum),
         *find_other_minimum(fit),
     ]
-    suspects = {name: test for name, test in _run_tests(fit, minimum).items() if test.p < DOUBTFUL}
+    suspects = {name: test for name, test in _run_tests(fit, minimum, freed).items() if test.p < DOUBTFUL}
     noticed = (
         any(ratio > FAR for ratio in excess.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)
@@ -420,21 +420,15 @@ def _find_noiseless(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
             )
 
 
-def _run_tests(fit: Fit, minimum: Minimum) -> dict[str, ScoreTest]:
+def _run_tests(fit: Fit, minimum: Minimum, freed: Freed | None) -> dict[str, ScoreTest]:
     """Test fixed parameters and delays; where residuals are coloured, those that make linear plants nonlinear too."""
-    problem = minimum.problem
     if fit.status == "not_identifiable":
         return {}
-    plain, bending = find_candidates(problem, fit)
-    delays = {
-        e.name: free_delay(e.data, e.slots.delay.value)
-        for e in problem.experiments
-        if e.slots.delay.index is None and not depends_on_time(e.model)
-    }
-    tests = run_score_tests(minimum, fit, plain, delays)
+    freed = freed or free_fixed(minimum.problem, minimum.z)
+    tests = run_score_tests(minimum, freed)
     white = all(output.whiteness_p > CHANCE for _, output in _list_outputs(fit))
-    for name in () if white else bending:
-        tests |= run_score_tests(minimum, fit, (name,))
+    for name in () if white else freed.bending:
+        tests |= run_score_tests(minimum, Freed.make(minimum.problem, minimum.z, (name,)))
     return tests
 
 

@@ -26,14 +26,15 @@ from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
 from seaopt.estimation.problem.residual_statistics import StatisticsByExperiment, compute_statistics
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import compute_bread, compute_meat
-from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.result.fit_result import Minimum
 from seaopt.estimation.solver.least_squares import find_blocked
 from seaopt.estimation.solver.step_shares import copy_steps
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants.published import GRAVITY
 from seaopt.records import record
-from seaopt.simulation import make_model
+from seaopt.simulation import depends_on_time, make_model
 
 REDUNDANT = 1e-7  # of what a parameter does to the outputs: less of it left, and the free ones do the same
 
@@ -51,25 +52,56 @@ class ScoreTest:
     fall: float  # by how much that step would lower the cost
 
 
-def run_score_tests(
-    minimum: Minimum, fit: Fit, names: tuple[str, ...] | None = None, data: Mapping[str, Experiment] | None = None
-) -> dict[str, ScoreTest]:
+@record(eq=False)
+class Freed:
+    """The problem of a fit in which more is free, at its minimum: what is to be tested."""
+
+    problem: FitProblem
+    z: Vector
+    units: Mapping[str, str]  # of what is free besides
+    bending: tuple[str, ...] = ()  # fixed parameters that are not free here, for they make a linear plant nonlinear
+
+    @classmethod
+    def make(
+        cls, problem: FitProblem, z: Vector, names: tuple[str, ...], data: Mapping[str, Experiment] | None = None
+    ) -> Freed:
+        """Return the problem in which parameters of these names are free, and the delays of experiments that have a
+        free one in `data`, under the name EXPERIMENT.delay_s.
+        """
+        units = {name: problem.params[name].unit for name in names} | {f"{name}.delay_s": "s" for name in data or {}}
+        freed, at = problem.rebuild(free_more(problem.params, names), z, data)
+        return cls(problem=copy_steps(freed, problem), z=at, units=units)
+
+
+def free_fixed(problem: FitProblem, z: Vector) -> Freed:
+    """Return the problem with all free that leaves linear plants linear, delays too. Its passes are made, where there
+    is room, and those of the problem itself kept as parts of them.
+    """
+    plain, bending = find_candidates(problem)
+    delays = {
+        e.name: free_delay(e.data, e.slots.delay.value)
+        for e in problem.experiments
+        if e.slots.delay.index is None and not depends_on_time(e.model)
+    }
+    freed = replace(Freed.make(problem, z, plain, delays), bending=bending)
+    problem.keep_within(z, freed.problem, freed.z)
+    return freed
+
+
+def run_score_tests(minimum: Minimum, freed: Freed | None = None) -> dict[str, ScoreTest]:
     """Test each parameter that was fixed, that which would do most first; without those the free ones stand for. A
     parameter that would make a linear plant nonlinear, such as friction fixed at zero, is not tested unless it is
-    named: the other plant is stepped and not discretised. `minimum`, `fit`: where, and of what; `names`: the parameters
-    to test; those that leave linear plants linear, if left out; `data`: experiments with a free delay, which is then
-    tested too, under the name EXPERIMENT.delay_s.
+    free in `freed`: the other plant is stepped and not discretised. `minimum`: where; `freed`: what is tested, all
+    parameters that leave linear plants linear if left out.
     """
-    names, data = find_candidates(minimum.problem, fit)[0] if names is None else names, data or {}
-    if not names and not data:
+    freed = freed or Freed.make(minimum.problem, minimum.z, find_candidates(minimum.problem)[0])
+    if not freed.units:
         return {}
-    trial, z = minimum.problem.rebuild(free_more(fit, names), minimum.z, data)
-    trial = copy_steps(trial, minimum.problem)
+    trial, z, units = freed.problem, freed.z, freed.units
     trial.keep(z)
     evaluation = trial.evaluate(z)
     if not np.isfinite(evaluation.cost):
         return {}
-    units = {name: fit.parameters[name].unit for name in names} | {f"{name}.delay_s": "s" for name in data}
     places = np.array([trial.unknowns.names.index(name) for name in units])
     statistics = minimum.statistics or compute_statistics(trial, z)
     score, information, variance = _compute_scores(trial, evaluation, places, statistics)
@@ -96,29 +128,31 @@ def _test(value: float, unit: str, score: float, information: float, variance: f
     )
 
 
-def find_candidates(problem: FitProblem, fit: Fit) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def free_delay(experiment: Experiment, value: float) -> Experiment:
+    """Return the experiment with a free delay that starts at a value."""
+    return replace(experiment, delay_s=Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0))
+
+
+def find_candidates(problem: FitProblem) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the fixed parameters whose freedom leaves linear plants linear, and those that would not."""
-    free = fit.parameters.free_names
+    params = problem.params
     plain: list[str] = []
     bending: list[str] = []
-    for name in fit.parameters:
+    for name, parameter in params.items():
         users = [e for e in problem.experiments if name in e.data.plant.parameters and name not in e.data.parameters]
-        if name in free or not users or all(e.data.plant.parameters[name] == GRAVITY for e in users):
+        if parameter.free or not users or all(e.data.plant.parameters[name] == GRAVITY for e in users):
             continue  # a constant is not at fault
         models = (
-            make_model(e.data.plant, e.data.apply_own(fit.parameters), (*e.model.free, name), e.data.outputs)
-            for e in users
+            make_model(e.data.plant, e.data.apply_own(params), (*e.model.free, name), e.data.outputs) for e in users
         )
         same = all(model.linear == e.model.linear for e, model in zip(users, models, strict=True))
         (plain if same else bending).append(name)
     return tuple(plain), tuple(bending)
 
 
-def free_more(fit: Fit, names: tuple[str, ...]) -> ParameterSet:
-    """Return the fit's parameters with more of them free."""
-    return fit.parameters.with_parameters(
-        *(replace(fit.parameters[name], free=True, prior_std=None, std=None) for name in names)
-    )
+def free_more(params: ParameterSet, names: tuple[str, ...]) -> ParameterSet:
+    """Return parameters with more of them free."""
+    return params.with_parameters(*(replace(params[name], free=True, prior_std=None, std=None) for name in names))
 
 
 def _compute_scores(

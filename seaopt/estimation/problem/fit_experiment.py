@@ -18,7 +18,18 @@ from seaopt.estimation.problem.shapes import Parts, PerOutput, Signal, Vector
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.problem.unknowns import Slot, Slots, find_places
 from seaopt.records import record
-from seaopt.simulation import Clock, Model, Pass, Point, Segment, Weights, count_stable_steps, run_passes, stream
+from seaopt.simulation import (
+    Clock,
+    Model,
+    Pass,
+    Point,
+    Segment,
+    Weights,
+    count_stable_steps,
+    keep_part,
+    run_passes,
+    stream,
+)
 
 CACHED_SAMPLES = 1 << 14  # whose sums stay in a core's cache
 FIRST_SAMPLES = 8_000  # that tell the integration error in an output, and a filter's sizes and places
@@ -201,6 +212,27 @@ class FitExperiment:
     def run(self, segment: FitSegment, z: Vector, **keep: Any) -> Pass:
         """Run the pass of one segment."""
         return run_passes(self.model, segment.samples, self.point(z), segment.start(z), self.weights, **keep)
+
+    def keep_within(self, z: Vector, wider: FitExperiment, at: Float[np.ndarray, " m"]) -> None:
+        """Make the passes of the same experiment with more unknowns, and keep those at z as a part of them; of a linear
+        plant they are as quick as copies.
+        """
+        point, other = self.point(z), wider.point(at)
+        if self.model.linear or (point.substeps, point.stable, point.halved) != (
+            other.substeps,
+            other.stable,
+            other.halved,
+        ):
+            return
+        free, delays = wider.model.free, [point.clock.delay_free, other.clock.delay_free]
+        columns = [0, *(1 + free.index(name) for name in self.model.free), *([1 + len(free)] if delays[0] else [])]
+        for segment, larger in zip(self.segments, wider.segments, strict=True):
+            own = range(1 + len(free) + delays[1], 1 + len(larger.columns[0]))
+            asked, more = (
+                (each.model, part.samples, where, part.start(unknowns), each.weights)
+                for each, part, where, unknowns in ((self, segment, point, z), (wider, larger, other, at))
+            )
+            keep_part(asked, more, [*columns, *own])
 
     def run_all(self, z: Vector, *, keep: bool = False) -> tuple[Pass, ...]:
         """Run the pass of every segment; those of a nonlinear plant keep the outputs of the first samples. `keep`: all

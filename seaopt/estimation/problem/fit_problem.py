@@ -140,6 +140,14 @@ class FitProblem:
         if sum(experiment.count_bytes() for experiment in self.experiments) <= measure_room():
             self.map(lambda experiment: experiment.run_all(z, keep=True))
 
+    def keep_within(self, z: Vector, wider: FitProblem, at: Float[np.ndarray, " m"]) -> None:
+        """Make the passes of the same problem with more unknowns with all that may be asked of them, and keep those at
+        z as parts of them, where there is room and both are simulations.
+        """
+        there = {experiment.name: experiment for experiment in wider.experiments}
+        if not self.predicts and sum(e.count_bytes() for e in wider.experiments) <= measure_room():
+            self.map(lambda experiment: experiment.keep_within(z, there[experiment.name], at))
+
     def evaluate(self, z: Vector) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""
         _evaluations.set(_evaluations.get() + 1)

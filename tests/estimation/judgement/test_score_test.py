@@ -31,7 +31,7 @@ def regression(u, v, y, c, **options):
     bench = so.Experiment(plant=SUM, log=log, initial_state="rest", offset=False, **options)
     params = so.ParameterSet.of(a=(1.0, "-"), c=(c, "-")).free("a")
     fit = so.fit([bench], params, method=so.OutputError(search=False))
-    return run_score_tests(fit.minimum, fit)["c"]
+    return run_score_tests(fit.minimum)["c"]
 
 
 def test_a_regression_has_the_textbooks_multiplier():
