@@ -69,6 +69,7 @@ class Candidate:
     # samples show a gain of many units by chance.
     kept: tuple[Experiment, ...] = ()
     frees: Mapping[str, float] = field(default_factory=dict[str, float])  # whose values to state, less these offsets
+    apart: bool = False  # each output has a delay of its own
     smoothed: Parameter | None = None  # what is freed, if it is a speed over which friction is smoothed
 
     def jumps(self, values: Values, stds: Values) -> bool:
@@ -100,7 +101,7 @@ def list_candidates(
             yield from _change_plant(experiments, problem.params, plant)
         yield _free_gains(experiments, problem.params)
     yield from _read_deflections(experiments, values)
-    yield from _free_delays(problem, values)
+    yield from _free_delays(problem, values, poor=poor)
     yield from _clip_outputs(problem, residuals, values)
     yield from _free_parameters(fit, minimum, suspects)
     yield from _filter_outputs(experiments, values)
@@ -207,8 +208,10 @@ def _adds_damping(plant: Plant, output: str, stiffness: str) -> bool:
     return resting < 1e-12 < motion
 
 
-def _free_delays(problem: FitProblem, params: ParameterSet) -> Iterator[Candidate]:
-    """Yield a delay of the inputs, and one for each output; negative where signals can be shifted."""
+def _free_delays(problem: FitProblem, params: ParameterSet, *, poor: bool) -> Iterator[Candidate]:
+    """Yield a delay of the inputs, with the spring's damper as well, and one for each output; negative where signals
+    can be shifted. `poor`: the damper may be tried nowhere else.
+    """
     experiments = [e.data for e in problem.experiments]
     stated = [e.slots.delay.value for e in problem.experiments]
     if any(e.slots.delay.index is not None for e in problem.experiments):
@@ -252,10 +255,37 @@ def _free_delays(problem: FitProblem, params: ParameterSet) -> Iterator[Candidat
         kept=kept,
         frees=dict(zip(names, shifts, strict=True)),
     )
-    if any(len(e.outputs) > 1 for e in experiments):
-        apart = tuple(_take_output(e, output) for e in shifted for output in e.outputs)
-        delays = tuple(f"{e.name}.delay_s" for e in apart)
-        yield Candidate(where=where, experiments=apart, params=params, says=describe_each, delays=delays, kept=kept)
+    if not any(len(e.outputs) > 1 for e in experiments):
+        return
+    if (damper := _find_damper(experiments, params)) is not None:
+
+        def describe_both(values: Values, stds: Values) -> str | None:
+            late, value = describe_common(values, stds), f"{damper.name} = {values[damper.name]:.4g}"
+            if late is None:
+                return _state_value(damper, False, values, stds) if poor else None
+            return f"{late}; with {value}{unit_after(damper.unit)} in place of {damper.value:.4g}, free it as well"
+
+        yield Candidate(
+            where=f"{where}, {damper.name}",
+            experiments=shifted,
+            params=params.with_parameters(replace(damper, free=True)),
+            says=describe_both,
+            delays=names,
+            kept=kept,
+            frees=dict(zip((*names, damper.name), (*shifts, 0.0), strict=True)),
+        )
+    apart = tuple(_take_output(e, output) for e in shifted for output in e.outputs)
+    delays = tuple(f"{e.name}.delay_s" for e in apart)
+    yield Candidate(
+        where=where, experiments=apart, params=params, says=describe_each, delays=delays, kept=kept, apart=True
+    )
+
+
+def _find_damper(experiments: Sequence[Experiment], params: ParameterSet) -> Parameter | None:
+    """Return what damps the spring of all plants, where it is fixed."""
+    names = {None if e.plant.spring is None else e.plant.spring.damper for e in experiments}
+    name = names.pop() if len(names) == 1 else None
+    return params[name] if name in params and not params[name].free else None
 
 
 def _state_delay(of: str, late: float, value: float) -> str:

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.budget import Budget
 from seaopt.estimation.judgement.candidates import Candidate, list_candidates
+from seaopt.estimation.judgement.held_out import compare_held_out
 from seaopt.estimation.judgement.hypothesis_search import Refit
 from seaopt.estimation.judgement.score_test import ScoreTest
 from seaopt.estimation.judgement.second_log import FAR
@@ -48,6 +49,7 @@ SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the 
 HALVED = 0.5  # of a residual's power: what leaves less is another explanation, wherever the estimates are
 MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
 HOPELESS, PATIENCE = 1.4, 8  # a misfit that is larger by so much of the samples, after so many iterations, stays so
+SURE = 2.5  # standard deviations by which one of two is nearer to held-out samples
 PROMISES = 0.5  # of a gain that counts: what shows with coarse steps, the same in fit and refit, before finer are made
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
 
@@ -66,7 +68,10 @@ class Cause:
     preferred: Mapping[str, tuple[float, float]]  # value and std that the refit gives what it frees
     refit: Refit | None = None  # of a hypothesis about what the model lacks
     jumps: bool = False  # friction that is smoothed: it is to stick, and its speed is not to be freed
-    unknowns: int  # how many its refit had
+    apart: bool = False  # channels that are late, each by itself
+    # of its refit, and where its minimum is
+    problem: FitProblem
+    z: Vector
 
 
 def find_causes(
@@ -119,7 +124,26 @@ def find_causes(
                 break
     best = max((cause.gain for cause in causes), default=0.0)
     # Of explanations that chance alone sets apart, the one that frees least comes first.
-    return sorted(causes, key=lambda c: (c.gain < best - ENOUGH, c.unknowns if c.gain >= best - ENOUGH else 0, -c.gain))
+    near = {id(cause) for cause in causes if cause.gain >= best - ENOUGH}
+    causes = sorted(causes, key=lambda c: (id(c) not in near, c.z.size if id(c) in near else 0, -c.gain))
+    return _drop_worse(fit, causes)
+
+
+def _drop_worse(fit: Fit, causes: list[Cause]) -> list[Cause]:
+    """Return the causes, the best first, with the better over held-out samples of channels that are late and the
+    spring's damper; both where chance alone sets them apart, or neither is the best.
+    """
+    dampers = {e.plant.spring.damper for e in fit.experiments if e.plant.spring is not None}
+    late = next((cause for cause in causes if cause.apart), None)
+    damped = next((cause for cause in causes if dampers & cause.preferred.keys()), None)
+    if late is None or damped is None or causes[0] not in (late, damped):
+        return causes
+    try:
+        nearer = compare_held_out((damped.problem, damped.z), (late.problem, late.z))
+    except SeaoptError:  # too little is left to fit
+        return causes
+    worse = late if nearer > SURE else damped if nearer < -SURE else None
+    return [cause for cause in causes if cause is not worse]
 
 
 def _measure_powers(evaluation: Evaluation, problem: FitProblem) -> Float[np.ndarray, "outputs 2"]:
@@ -295,5 +319,7 @@ def _weigh(
         else {name: (values[name] - shift, stds[name]) for name, shift in candidate.frees.items()},
         jumps=jumps,
         material=bool(moved) or candidate.certain or (left < HALVED and not (inside and _is_near_noise(fit))),
-        unknowns=len(values),
+        apart=candidate.apart,
+        problem=problem,
+        z=evaluation.z,
     )

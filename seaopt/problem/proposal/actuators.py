@@ -143,7 +143,9 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
     identified = (effort and (motor or "deflection" in facts.outputs)) or (moves and (motor or link))
     why = _SCALES.format("J_m, b_r and f_c scale")
     lines.perhaps("k_s", "Stiffness of the spring k_s", identified=identified, why=why)
-    interview.assume("c_s", "an undamped spring; with the link held its damping adds to b_r")
+    interview.assume(
+        "c_s", "an undamped spring; with the link held its damping adds to b_r; a fit says where it explains more"
+    )
     lines.add("c_s", "0")
     if moves:
         lines.free("J_l")
