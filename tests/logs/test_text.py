@@ -216,7 +216,7 @@ def test_headers_that_repeat_are_numbered_and_those_over_two_lines_joined():
 
 
 def test_columns_named_like_a_time_and_columns_that_wrap():
-    assert [is_time_name(name) for name in ("Zeit [ms]", "imu.t", "F1 [N]")] == [True, True, False]
+    assert [is_time_name(name) for name in ("Zeit [ms]", "stamp [ms]", "imu.t", "F1 [N]")] == [True, True, True, False]
     assert suspect_wrap(np.array([0.0, 3.0, 65530.0, 65535.0, 1.0]), 0.0, 65535.0) == 16
     assert spell_column(column="cur", unit="A") == 'column = "cur", unit = "A"'
 

@@ -17,12 +17,11 @@ from seaopt.logs.log.alignment import Rule
 from seaopt.logs.reading.clock_samples import guess_time_unit
 from seaopt.logs.reading.column import Column, spell_column
 from seaopt.logs.reading.counter import Counter
-from seaopt.logs.reading.vocabulary import find_unit_in_name
+from seaopt.logs.reading.vocabulary import QUANTITY_WORDS, find_unit_in_name
 from seaopt.records import record
 from seaopt.signals import check_distinct
 from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
-_TIME_NAMES = frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout"})
 _TIME_ENDING = re.compile(r"[_ ](s|ms|us|ns)$")
 MAX_NAMES = 20  # in a message
 HOW_TO_ALIGN = "align it by Hold(), Linear(), Nearest(tolerance_s=...) or Readings()"
@@ -373,7 +372,7 @@ def advise_time(source: Source) -> str:
 
 def is_time_name(name: str) -> bool:
     """Tell whether a column is named like a time."""
-    return re.split(r"[./]", bare_name(name))[-1].casefold() in _TIME_NAMES
+    return re.split(r"[./]", bare_name(name))[-1].casefold() in QUANTITY_WORDS["time"]
 
 
 def _find_channel_clock(clock: ClockColumn, file_column: FileColumn) -> ClockColumn:
