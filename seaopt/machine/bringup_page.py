@@ -17,7 +17,7 @@ from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
-from seaopt.reporting.sections.kinds.controller import say_bandwidths, show_stuck_bandwidth
+from seaopt.reporting.sections.kinds.controller import explain_sliding, say_bandwidths, show_stuck_bandwidth
 from seaopt.units import unit_after
 
 PARTS = {"stages": "Stages", "provenance": "Provenance"}
@@ -103,7 +103,8 @@ def describe(result: BringUp) -> list[Section]:
 def _explain_bandwidths(controller: Controller) -> tuple[str, ...]:
     """Return which bandwidth is which, where friction makes two."""
     stuck = show_stuck_bandwidth(controller)
-    return (TWO_BANDWIDTHS.format(say_bandwidths(controller, controller.spec.bandwidth_hz)),) if stuck else ()
+    both = [TWO_BANDWIDTHS.format(say_bandwidths(controller, controller.spec.bandwidth_hz))] if stuck else []
+    return (*both, *explain_sliding(controller))
 
 
 def _explain_friction(controller: Controller) -> tuple[str, ...]:

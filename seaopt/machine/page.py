@@ -31,7 +31,7 @@ from seaopt.reporting.sections.data import (
     Verdict,
     mark_met,
 )
-from seaopt.reporting.sections.kinds.controller import say_bandwidths, show_stuck_bandwidth
+from seaopt.reporting.sections.kinds.controller import explain_sliding, say_bandwidths, show_stuck_bandwidth
 from seaopt.units import unit_after
 
 PARTS = {
@@ -312,6 +312,7 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     if show_stuck_bandwidth(result.controller):
         both = say_bandwidths(result.controller, result.controller.achieved.bandwidth_hz)
         remarks.append(f"Predicted is the actuator as it slides, but for a figure stuck; its bandwidth is {both}.")
+    remarks += explain_sliding(result.controller)
     remarks += [_say_stuck(row, result.controller) for row in response.judged if row.state == "stuck"]
     if response.still:
         unit = unit_after(result.controller.command.effort_unit)

@@ -36,7 +36,7 @@ from seaopt.estimation import warn_unidentified
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import find_dry_friction, name_slope_unit, split_friction, take_sliding
+from seaopt.plants.friction import falls, find_dry_friction, name_slope_unit, slide_fast, split_friction, take_sliding
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import MotorRating, rate_motor
 from seaopt.plants.plant import find_range
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 # Among what controller.json says is achieved:
 FRICTION_MARGIN, WITHOUT_PREFILTER = "friction_margin", "bandwidth_without_prefilter_hz"
+SLIDING_FAST = "bandwidth_sliding_fast_hz"
 SCALE = (5e-3, 5.0)  # by which a reading is off, from and up to: play at rest is no other stiffness
 UNFILTERED = 0.1  # of the sample time: a derivative's filter that does next to nothing
 ARRIVAL_PERIODS, NOT_ARRIVED = 20.0, 0.05  # of the bandwidth, after which a step is to be nearer than this share
@@ -258,6 +259,18 @@ class Controller(ClosesLoops, Result, Worded):
         return loop.figures().bandwidth_hz
 
     @property
+    def bandwidth_sliding_fast_hz(self) -> float | None:
+        """The bandwidth on the design plant where it slides fast; that of `achieved` is where friction falls the most.
+
+        None where no friction falls with the speed, of a loop that does not come to -3 dB, and of a measured design
+        plant.
+        """
+        if self.design is None or not falls(*self.design):
+            return None
+        plant, params = self.design
+        return Loop(plant=self.plant(slide_fast(plant), params), law=self.law).figures().bandwidth_hz
+
+    @property
     def designs_on_response(self) -> bool:
         """Whether all limits are asked of a measured response."""
         return self.design is None or self.designed_on_response
@@ -454,7 +467,7 @@ class Controller(ClosesLoops, Result, Worded):
             "measurement": paths[0] if len(paths) == 1 else paths,
             "command": self.command,
             "spec": self.spec.to_dict() | {"robust_to": self.robust_to},
-            "achieved": _list_achieved(self.achieved) | friction | self._prefilter_figures(),
+            "achieved": _list_achieved(self.achieved) | friction | self._prefilter_figures() | self._friction_figures(),
             "feasible": self.met,
             "active_constraints": self.active_constraints,
             "engineering": {name: {"value": value, "unit": unit} for name, (value, unit) in self.engineering.items()},
@@ -470,6 +483,10 @@ class Controller(ClosesLoops, Result, Worded):
     def _prefilter_figures(self) -> dict[str, float | None]:
         """Return what is achieved without the prefilter, where there is one."""
         return {} if self.prefilter is None else {WITHOUT_PREFILTER: self.bandwidth_without_prefilter_hz}
+
+    def _friction_figures(self) -> dict[str, float | None]:
+        """Return what is achieved where the design plant slides fast, if friction falls with the speed before."""
+        return {SLIDING_FAST: self.bandwidth_sliding_fast_hz} if self.design and falls(*self.design) else {}
 
     @classmethod
     def read(cls, content: Mapping[str, Any]) -> Controller:
@@ -506,6 +523,8 @@ class Controller(ClosesLoops, Result, Worded):
         check_achieved(content.get("achieved"), _list_achieved(controller.achieved))
         check_friction_margin(content["achieved"].get(FRICTION_MARGIN), controller.friction)
         check_achieved(content["achieved"], controller._prefilter_figures())
+        if SLIDING_FAST in content["achieved"]:  # older files have none
+            check_achieved(content["achieved"], controller._friction_figures())
         loops = [controller.design_loop]
         if controller.design is not None:
             states = controller.measure_states()

@@ -119,3 +119,32 @@ def test_a_bandwidth_that_a_falling_plant_allows_is_named_and_can_be_had(plant):
     assert 14.0 <= largest < 15.0 and f"{largest:.4g} Hz" in controller.explanation
     assert "friction" not in controller.explanation
     assert so.tune(plant, params, replace(near, bandwidth_hz=largest)).feasible
+
+
+def test_the_sliding_bandwidth_is_a_range_from_fast_to_the_steepest_fall(plant, tuned):
+    """Fast a curve falls no more, as that of Coulomb's friction alone; no motion keeps to the speed of the fall."""
+    params = falling(plant, 35.0, 0.02)
+    coulomb = tuned.close(plant, params.update(f_s=VALUES["f_c"])).figures().bandwidth_hz
+    assert tuned.bandwidth_sliding_fast_hz == pytest.approx(coulomb, rel=1e-9)
+    assert coulomb < 0.95 * tuned.achieved.bandwidth_hz
+    content = json.loads(to_json(tuned.to_dict()))
+    assert content["achieved"]["bandwidth_sliding_fast_hz"] == pytest.approx(coulomb, rel=1e-9)
+    verdict, *_ = repr(tuned).splitlines()
+    assert f"{coulomb:.3g} to 20 Hz sliding and" in verdict
+    assert f"{coulomb:.4g} Hz where it slides fast" in " ".join(repr(tuned).split())
+
+
+def test_a_file_states_the_range_that_its_law_has(plant, tuned):
+    params, content = falling(plant, 35.0, 0.02), json.loads(to_json(tuned.to_dict()))
+    assert so.Controller.from_dict(content, plant, params).bandwidth_sliding_fast_hz is not None
+    content["achieved"]["bandwidth_sliding_fast_hz"] *= 1.01
+    with pytest.raises(FileError, match="bandwidth_sliding_fast_hz"):
+        so.Controller.from_dict(content, plant, params)
+    del content["achieved"]["bandwidth_sliding_fast_hz"]  # as older files are
+    so.Controller.from_dict(content, plant, params)
+
+
+def test_friction_that_does_not_fall_makes_no_range(plant, tuned):
+    coulomb = replace(tuned, design=(plant, falling(plant, VALUES["f_c"], 0.02)))
+    assert coulomb.bandwidth_sliding_fast_hz is None
+    assert "bandwidth_sliding_fast_hz" not in coulomb.to_dict()["achieved"]

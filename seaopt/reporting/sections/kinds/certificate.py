@@ -21,7 +21,7 @@ from seaopt.reporting.sections.data import (
     list_notes,
     mark_met,
 )
-from seaopt.reporting.sections.kinds.controller import show_costs
+from seaopt.reporting.sections.kinds.controller import explain_sliding, show_costs
 from seaopt.reporting.sections.kinds.simulated import list_left_out, summarise_findings
 from seaopt.reporting.sections.kinds.verification import describe_steps
 from seaopt.robustness import Certificate
@@ -205,6 +205,7 @@ def describe(certificate: Certificate) -> list[Section]:
                 "Stability by eigenvalues, peaks and crossings by level sets, not off a grid. Gain: how far it may rise"
                 "; the delay margin is that of the sampled loop with the delay in it; worst: of the worst case found.",
                 *([SWINGS] if _swings(certificate) else []),
+                *(explain_sliding(law) if isinstance(law := certificate.controller, Controller) else ()),
                 *_describe_simulation(certificate),
             ),
         ),

@@ -35,8 +35,14 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
 
 
 def say_bandwidths(controller: Controller, bandwidth_hz: float | None) -> str:
-    """Return a bandwidth; where friction makes two of it, with the one that is left while it sticks."""
+    """Return a bandwidth; where friction makes two of it, with the one that is left while it sticks, and where it falls
+    with the speed, from the one where it slides fast.
+    """
     moving, stuck = format_figure(bandwidth_hz, "Hz", missing="none"), show_stuck_bandwidth(controller)
+    fast = _measure_fast(controller)
+    if fast is not None and bandwidth_hz is not None:
+        low, high = sorted((fast, bandwidth_hz))
+        moving = f"{format_number(low, 3)} to {format_figure(high, 'Hz')}"
     if stuck:
         return f"{moving} sliding and {stuck} Hz stuck"
     return f"{moving} sliding" if _measure_stuck(controller) else moving
@@ -55,6 +61,22 @@ def show_stuck_bandwidth(controller: Controller) -> str:
 def _measure_stuck(controller: Controller) -> list[tuple[str, LoopFigures]]:
     """Return the figures of the design plant where its friction sticks, by state; none without friction."""
     return [] if controller.design is None else [*controller.measure_states().items()][1:]
+
+
+@lru_cache(maxsize=4)
+def _measure_fast(controller: Controller) -> float | None:
+    """Return the bandwidth where the design plant slides fast, if its friction falls with the speed before."""
+    return controller.bandwidth_sliding_fast_hz
+
+
+def explain_sliding(controller: Controller) -> Iterator[str]:
+    """Yield of which sliding a bandwidth is, where friction falls with the speed."""
+    if (fast := _measure_fast(controller)) is not None:
+        falling = format_number(controller.achieved.bandwidth_hz, missing="none")
+        yield (
+            f"Friction that falls with the speed makes a range of the sliding bandwidth: {falling} Hz where it falls "
+            f"the steepest, which no motion keeps to, and {format_number(fast)} Hz where it slides fast."
+        )
 
 
 def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[str, ...]:
@@ -134,8 +156,11 @@ def list_achieved(controller: Controller) -> list[tuple[str, str, str]]:
     rows, stuck = list[tuple[str, str, str]](), _measure_stuck(controller)
     for row in list_design_figures(controller.spec, controller.design_loop):
         two = row.limit.name == "bandwidth_hz" and show_stuck_bandwidth(controller)
-        label = f"{row.limit.label}, sliding" if two else row.limit.label
+        fast = _measure_fast(controller) if row.limit.name == "bandwidth_hz" else None
+        label = f"{row.limit.label}, sliding" if two or fast is not None else row.limit.label
         rows.append((label, format_figure(row.value, row.unit), row.allowed_text))
+        if fast is not None:
+            rows.append((f"{row.limit.label}, sliding fast", format_figure(fast, "Hz"), ""))
         if two:
             rows += [
                 (f"{row.limit.label},{state}", format_figure(each.bandwidth_hz, "Hz"), "") for state, each in stuck
@@ -194,6 +219,7 @@ def _describe_friction(controller: Controller) -> Iterator[str]:
         limit = "" if asked is None else f" (asked {asked:g})"
         slope = f"{format_number(loop.friction_slope)} {loop.slope_unit}"
         yield f"Friction margin {slope}{limit}: {controller.friction.describe()}."
+    yield from explain_sliding(controller)
     sliding = "These figures are of the sliding design plant, on which the bandwidth is placed;"
     if controller.design[0].sticks:
         sliding = f"{sliding} a reference that moves the motor less than its friction holds is not followed;"
