@@ -59,6 +59,13 @@ def check_table(
         raise error(f"{source}: {_describe(model, problem, remedy)}") from problem
 
 
+def has_unknown_key(error: SeaoptError) -> bool:
+    """Tell whether an error of `check_table` is a key that nothing reads."""
+    cause = error.__cause__
+    mistakes = cause.errors(include_url=False) if isinstance(cause, ValidationError) else []
+    return any(mistake["type"] == "extra_forbidden" for mistake in mistakes)
+
+
 def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> str:
     """Return the mistake that the others follow from: place, value and remedy."""
     mistakes = problem.errors(include_url=False)

@@ -36,9 +36,8 @@ def export_controller(
     **options: Any,
 ) -> bool:
     """Write the controller of `results` to `target`, say what was written, and tell whether it may be used. It may
-    where it is feasible, on a fit that is met, and its certificate, where the folder has one, did not fail. Raises
-    SeaoptError: there is no controller, it was edited or made from another fit than the one beside it, or it cannot be
-    written.
+    where it is feasible, on a fit that is met, and the certificate beside it passed. Raises SeaoptError: there is no
+    controller, it was edited or made from another fit than the one beside it, or it cannot be written.
     """
     path, certificate = results / FILES["tune"], results / FILES["certify"]
     of_problem = f"PROBLEM -o {shlex.quote(str(results))}"
@@ -55,10 +54,17 @@ def export_controller(
         options["derate"] = read_guard(content, derate_margin_K) or True
     options["gate"] = choose_gate(content, gate or {}, options)
     failed = _list_broken_requirements(path, certificate)
+    options["uncertified"] = (
+        "seaopt certify was not run on this law"
+        if failed is None
+        else f"the certificate of this law FAILED: {', '.join(failed)}"
+        if failed
+        else ""
+    )
     write = _write_plan if "mpc" in content else export
     written = [str(file) for file in write(content, target, **options)]
     feasible, fit_met = content["feasible"], content.get("fit_met", True) is True
-    met = feasible and fit_met and not failed
+    met = feasible and fit_met and failed == []
     if limit := _find_raised_limit(content, options):
         what, says = ("designed", "figures say") if failed is None else ("certified", "certificate says")
         Terminal(stderr=True).wrap(
@@ -88,12 +94,12 @@ def export_controller(
     for good, text in (
         (fit_met, UNMET),
         (feasible, "; ".join(missed)),
-        (not failed, f"the certificate of this controller FAILED: {', '.join(failed or ())}"),
+        (failed == [], f"not certified: {options['uncertified']}"),
     ):
         if not good:
             console.wrap(f"not met: {text}")
     if failed is None:
-        console.wrap(f"not certified: type seaopt certify {of_problem}")
+        console.wrap(f"next: type seaopt certify {of_problem}")
     if amount != "quiet" or met:
         console.list_files(written)
     for note in content.get("notes") or () if amount == "verbose" else ():
@@ -215,7 +221,7 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
     if not options.pop("allow_infeasible", False) and not content["feasible"]:
         missed = join_labels(content["active_constraints"])
         raise ProblemError(f"the controller misses {missed}; tune one that does not, or type --allow-infeasible")
-    gate, derate = options.pop("gate"), options.pop("derate")
+    gate, derate, _ = options.pop("gate"), options.pop("derate"), options.pop("uncertified")
     typed = {name for name, value in options.items() if value not in (None, False) and name != "precision"}
     if typed - {"name"} or options["name"] != "force_law":
         raise ProblemError(

@@ -548,11 +548,18 @@ class Session:
                 verdicts.append(Verdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
             result = result if self.problem.mpc is None else self.plan()
         again = self._spell("run" if self.problem.table.experiment else "tune")
-        verdict = judge(result, Commands(fit=self._spell("fit"), tune=self._spell("tune"), certify=again))
+        fitted = dict.fromkeys(table.plant for table in self.problem.table.experiment if table.use == "fit")
+        commands = Commands(
+            fit=self._spell("fit"), tune=self._spell("tune"), certify=again, plants=tuple(fitted) or Commands().plants
+        )
+        verdict = judge(result, commands)
         assert verdict is not None
         verdicts.append(verdict)
         if stage != "fit" and not self.fit_met():
             return [doubt_design(verdict) for verdict in verdicts]
+        if self.problem.refused:  # a warning that a long fit's progress has left behind
+            wrong = f"{self.problem.refused}; a design refuses this"
+            verdicts = [replace(each, next=(*each.next, wrong)) for each in verdicts]
         guesses = state_guesses(self.problem.table.guessed)
         return [name_guesses(verdict, guesses) for verdict in verdicts]
 

@@ -118,6 +118,8 @@ def _export(stage: Stage, folder: Path, tare: Tare | None, fit_met: bool | None)
     if isinstance(source, ForceMPC):
         return [export_mpc(source, folder)]
     options: dict[str, Any] = {"log_rows": LOG_ROWS, "tare": tare, "stop": stage.stop}
+    if not stage.certificate.met:
+        options["uncertified"] = "the certificate of this stage's law FAILED"
     return [*export(source, folder, allow_infeasible=True, fit_met=fit_met, **options)]
 
 

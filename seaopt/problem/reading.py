@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from seaopt.control import ControllerSpec
-from seaopt.documents import check_table
+from seaopt.documents import check_table, has_unknown_key
 from seaopt.errors import FileError, ProblemError, SeaoptError, require_type
 from seaopt.files import check_regular, exists, parse_file
 from seaopt.plants import Plant, plant_of_kind
@@ -42,7 +42,8 @@ def read_problem(path: Path | str, *, design: bool = True) -> Problem:
         The file.
     design : bool
         False: of a file in which only what a design needs is wrong ([controller], [impedance], [mpc], [robustness],
-        [expect]), read the rest, which a fit needs; `Problem.refused` then says what is wrong.
+        [expect]), read the rest, which a fit needs; `Problem.refused` then says what is wrong. A key that nothing
+        reads is refused all the same.
 
     Raises
     ------
@@ -65,7 +66,7 @@ def read_problem(path: Path | str, *, design: bool = True) -> Problem:
     try:
         return _make(content, str(path))
     except SeaoptError as error:
-        if design:
+        if design or has_unknown_key(error):
             raise
         refused = str(error)
     fitted = {key: value for key, value in content.items() if key not in OF_DESIGN}

@@ -153,12 +153,17 @@ def test_a_controller_whose_certificate_failed_exits_1(done, seaopt, tmp_path):
     content = json.loads(seaopt("export", tmp_path, "--c", tmp_path / "out", "--json").stdout)
     assert content["certified"] is False and content["certificate_failed"]
     assert len(list((tmp_path / "out").iterdir())) == 4
+    header = (tmp_path / "out" / "force_law.h").read_text(encoding="utf-8")
+    assert f"NOT CERTIFIED: the certificate of this law FAILED: {content['certificate_failed'][0]}" in header
 
 
 def test_a_controller_that_was_never_certified_says_so(done, seaopt, tmp_path):
     (tmp_path / "controller.json").write_bytes((done.results / "controller.json").read_bytes())
     out = seaopt("export", tmp_path, "--c", tmp_path / "out")
-    assert out.returncode == 0 and f"not certified: type seaopt certify PROBLEM -o {tmp_path}" in out.stdout
+    assert out.returncode == 1 and f"next: type seaopt certify PROBLEM -o {tmp_path}" in out.stdout
     content = json.loads(seaopt("export", tmp_path, "--c", tmp_path / "out", "--json").stdout)
-    assert content["certified"] is False
+    assert content["met"] is False and content["certified"] is False
+    for name in ("force_law.h", "force_law_gains.h", "force_law_gains.m"):
+        assert "NOT CERTIFIED: seaopt certify was not run" in (tmp_path / "out" / name).read_text(encoding="utf-8")
     assert "not certified" not in seaopt("export", done.results, "--c", tmp_path / "out").stdout
+    assert "NOT CERTIFIED" not in (tmp_path / "out" / "force_law.h").read_text(encoding="utf-8")

@@ -41,7 +41,7 @@ def test_tune_writes_a_schedule_that_export_takes(knee, seaopt):
     assert content["schema"] == "seaopt/controller/3" and content["schedule"]["points"] == [0.0, 0.35]
     assert not list(validator("controller").iter_errors(content))
     written = seaopt("export", "out", "--c", "c", "--name", "knee")
-    assert written.returncode == 0 and {path.name for path in (knee / "c").iterdir()} == {"knee.h", "knee.c"}
+    assert written.returncode == 1 and {path.name for path in (knee / "c").iterdir()} == {"knee.h", "knee.c"}
     assert "not certified" in written.stdout
 
 
@@ -52,9 +52,9 @@ def test_a_schedule_has_the_gate_of_its_file_at_every_point_and_in_c(knee, seaop
     assert seaopt("tune", "knee.toml").returncode == 0
     content = json.loads((knee / "out" / "controller.json").read_text(encoding="utf-8"))
     assert content["guards"]["gate"]["range_N"] == [-200.0, 200.0]
-    assert seaopt("export", "out", "--c", "c", "--name", "knee").returncode == 0
+    assert seaopt("export", "out", "--c", "c", "--name", "knee").returncode == 1
     assert "A reading is believed" in (knee / "c" / "knee.h").read_text(encoding="utf-8")
-    assert seaopt("export", "out", "--c", "d", "--name", "knee", "--no-gate").returncode == 0
+    assert seaopt("export", "out", "--c", "d", "--name", "knee", "--no-gate").returncode == 1
     assert "A reading is believed" not in (knee / "d" / "knee.h").read_text(encoding="utf-8")
 
 

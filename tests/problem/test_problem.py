@@ -31,7 +31,6 @@ def test_the_packaged_problem_is_the_one_in_problems():
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [("bandwidth_hz = 30", "bandwidth_hz = 3", "bandwidth_hz = 3 is outside 15 to 60"),
-     ("[controller]", "[controller]\nstep = 3", "unknown key controller.step"),
      ('[controller]\nplant = "stand"', '[controller]\nplant = "bench"', 'controller.plant = "bench" is not a [plant]')],
 )  # fmt: skip
 def test_what_only_a_design_needs_keeps_no_fit_from_the_file(write, old, new, said):
@@ -44,6 +43,13 @@ def test_what_only_a_design_needs_keeps_no_fit_from_the_file(write, old, new, sa
     assert problem.parameters == good.parameters and problem.fit_options == good.fit_options
     with pytest.raises(so.SeaoptError, match=re.escape(said)):
         _ = problem.design_plant
+
+
+def test_a_misspelt_key_of_a_design_is_refused_ahead_of_a_fit(write):
+    """A fit of minutes would end ahead of a design that its file does not have."""
+    path = write(TEXT.replace("bandwidth_hz = 30", "bandwith_hz = 30"))
+    with pytest.raises(so.SeaoptError, match=r'bandwith_hz; did you mean "bandwidth_hz"\? write bandwidth_hz = 30'):
+        so.read_problem(path, design=False)
 
 
 def test_what_a_fit_needs_is_refused_without_a_design_too(write):

@@ -116,7 +116,7 @@ def test_a_term_is_marked_with_its_meaning():
     assert explain_terms("whiteness p") == f'<abbr title="{html.escape(GLOSSARY["whiteness p"])}">whiteness p</abbr>'
 
 
-def test_a_cure_is_a_line_of_the_problem_file():
-    delay = spell_cure("chirp.delay_s", 0.004)
-    assert delay == "delay_s = { value = 0.004, free = true, max = 0.02 } in the [[experiment]] chirp"
-    assert spell_cure("f_c", 12.0) == "f_c = { value = 12, free = true } in [parameters]"
+def test_a_cure_is_a_line_of_the_problem_file_with_its_place():
+    place, delay = spell_cure("chirp.delay_s", 0.004)
+    assert place.startswith("[[experiment]] chirp") and delay == "delay_s = { value = 0.004, free = true, max = 0.02 }"
+    assert spell_cure("f_c", 12.0) == ["[parameters]", "f_c = { value = 12, free = true }"]

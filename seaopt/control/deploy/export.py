@@ -81,6 +81,7 @@ def export(
     derate: bool | HeatGuard | None = None,
     allow_infeasible: bool = False,
     fit_met: bool | None = None,
+    uncertified: str = "",
     log_rows: int | None = None,
     tare: Tare | None = None,
     stop: Mapping[str, float] | None = None,
@@ -114,6 +115,8 @@ def export(
     fit_met : bool, optional
         Whether the fit that it was tuned with is met; the files state one that is not. What a controller.json says of
         it, if left out.
+    uncertified : str
+        Why no certificate vouches for it, in words that the files state; "" where one does, or where nothing is said.
     log_rows : int, optional
         Rows of a ring, a power of two: NAME_log.h and NAME_log.c log what the law is given and returns
         (`seaopt.control.deploy.target`).
@@ -194,6 +197,7 @@ def export(
         "NAME": prefix.upper(),
         "precision": precision,
         "fit_met": fit_met,
+        "uncertified": strip_markup(uncertified),
         "raised_from": strip_markup(find_raised_limit(stored.command, stored.spec, limit)),
     }
     templates = dict(templates)

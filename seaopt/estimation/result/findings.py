@@ -25,6 +25,7 @@ class FitFinding:
 
     json_keys = (
         *("severity", "kind", "where", "text", "preferred"),
+        Key(field="together", name="together", omit_none=True),
         Key(field="proposal", name="proposal", omit_none=True),
         Key(field="python", name="python", omit_none=True),
         Key(field="sticks", name="sticks", omit_none=True),
@@ -38,6 +39,7 @@ class FitFinding:
     text: str  # with the remedy
     # value and std of what a "cause" frees, by name
     preferred: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+    together: tuple[str, ...] | None = None  # of those, what the "cause" that is named first frees
     # what adds a "cause" that a part brings, or lets friction jump: lines of a problem file for a plant NAME, and calls
     proposal: str | None = None
     python: str | None = None

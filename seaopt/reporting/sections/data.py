@@ -105,7 +105,9 @@ class Reason:
 
 @record
 class Verdict:
-    """Whether a result is met, in one line; why not; and what comes next: a command, or lines of the problem file."""
+    """Whether a result is met, in one line; why not; and what comes next: a command, or what to write where, with the
+    lines of a problem file below it, to be copied as they are.
+    """
 
     met: bool
     text: str
@@ -130,6 +132,7 @@ class Commands:
     fit: str = ""
     tune: str = ""
     certify: str = ""
+    plants: tuple[str, ...] = ("NAME",)  # the tables of the plants that are fitted
 
     @property
     def sweep(self) -> str:

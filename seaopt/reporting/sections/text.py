@@ -70,10 +70,12 @@ def render_verdict(verdict: Verdict, width: int = WIDTH, most: Most | None = Non
         lines += wrap(str(reason), width, indent=LABEL)
     lines += _count_hidden(len(verdict.reasons), most.reasons, LABEL)
     for text in verdict.next:
-        advice, command, options = text.partition(COMMAND)
+        said, *copied = text.splitlines()
+        advice, command, options = said.partition(COMMAND)
         lines += wrap(f"next: {advice}{'type' if command else ''}", width, indent=LABEL)
-        if command:  # on a line of its own, to be copied
-            lines.append(((f"{' ' * (LABEL + 2)}seaopt{options}", ""),))
+        if command:
+            copied = [f"seaopt{options}"]
+        lines += [((f"{' ' * (LABEL + 2)}{line}", ""),) for line in copied]
     return lines
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from seaopt.estimation import Fit
 from seaopt.estimation.result.findings import DerivedFigure, LogValues
@@ -13,6 +13,7 @@ from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Se
 from seaopt.units import unit_after
 
 RESOLVED = 2.0  # standard deviations by which a value differs from zero, to be proposed
+NAME = "NAME"  # of a plant, in the lines that add a part to it
 DELAY_ROOM = 5.0  # times a delay that was found, up to which it may go
 MOST_PLACES = 3  # that a reason names
 EXPLAINED = (
@@ -35,13 +36,13 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     errors = [(each.text, each.where) for each in fit.errors]
     if fit.status != "converged" and not _repeats(fit):
         errors.insert(0, (fit.message, ""))
-    reasons, cures = tuple(_group(errors)), "; or ".join(_list_cures(fit))
-    again = f"correct the file, then type {commands.fit}" if commands.fit else ""
+    reasons = tuple(_group(errors))
+    again = [f"correct the file, then type {commands.fit}"] if commands.fit else []
     return Verdict(
         met=False,
         text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met{_name_silent(fit)}",
         reasons=reasons,
-        next=tuple(filter(None, (cures, again))),
+        next=(*_list_cures(fit, commands.plants), *again),
     )
 
 
@@ -238,34 +239,41 @@ def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:
         yield Reason(what=what, where=text, count=1 + len(named[MOST_PLACES:]))
 
 
-def _list_cures(fit: Fit) -> tuple[str, ...]:
-    """Return the lines to write for the likely cause that is named first. What is not told from zero is not to be
-    freed, nor how sharp friction is: a search for that takes long and ends nowhere. What comes with a part comes
-    with its line.
+def _list_cures(fit: Fit, plants: Sequence[str]) -> Iterator[str]:
+    """Yield what to write for the likely cause that is named first, with the lines, place by place. What is not told
+    from zero is not to be freed, nor how sharp friction is: a search for that takes long and ends nowhere. What comes
+    with a part comes with its line.
     """
     causes = (each for each in fit.findings if each.kind == "cause" and (each.preferred or each.sticks))
     cause = next(causes, None)
     if cause is None:
-        return ()
-    sticking = ["sticks = true in [plant.NAME]"] if cause.sticks else []
-    apart = {name: value for name, (value, std) in cause.preferred.items() if abs(value) > RESOLVED * std}
-    added = {name: row.proposal.replace("\n", " ") for row in reversed(fit.hypotheses) for name in row.frees}
-    lines = (
-        added[name] if name in added and name not in fit.parameters else spell_cure(name, value)
-        for name, value in apart.items()
-    )
-    return tuple(dict.fromkeys(filter(None, [*sticking, *lines])))
+        return
+    lines = [f"[plant.{NAME}]", "sticks = true"] if cause.sticks else list[str]()
+    added = {name: row.proposal.splitlines() for row in reversed(fit.hypotheses) for name in row.frees}
+    for name in cause.preferred if cause.together is None else cause.together:
+        value, std = cause.preferred[name]
+        if abs(value) > RESOLVED * std:
+            lines += added[name] if name in added and name not in fit.parameters else spell_cure(name, value)
+    places, place = dict[str, dict[str, None]](), ""
+    for line in lines:
+        place = line if line.startswith("[") else place
+        places.setdefault(place, {}).update({} if line == place else {line: None})
+    for place, rows in places.items():
+        for header in [place.replace(NAME, name) for name in plants] if NAME in place else [place]:
+            yield "\n".join([f"write under {header}, in place of a line of the same name:", *rows])
 
 
-def spell_cure(name: str, value: float) -> str:
-    """Return the line of a problem file that frees what a log would have otherwise; "" where there is no such line."""
+def spell_cure(name: str, value: float) -> list[str]:
+    """Return the place in a problem file and the line there that frees what a log would have otherwise; nothing where
+    there is no such line.
+    """
     *experiment, parameter = name.split(".")
     if not experiment:
-        return f"{parameter} = {{ value = {value:.4g}, free = true }} in [parameters]"
+        return ["[parameters]", f"{parameter} = {{ value = {value:.4g}, free = true }}"]
     if parameter == "delay_s" and value > 0.0:
         settings = f"value = {value:.4g}, free = true, max = {DELAY_ROOM * value:.2g}"
-        return f"delay_s = {{ {settings} }} in the [[experiment]] {experiment[0]}"
-    return ""
+        return [f"[[experiment]] {experiment[0]}, beside its log", f"delay_s = {{ {settings} }}"]
+    return []
 
 
 def _remark(parameter: Parameter) -> str:

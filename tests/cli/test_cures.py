@@ -1,0 +1,75 @@
+"""What a fit says to write into its problem file, written there: the file is read, and its fit is met."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import pytest
+
+import seaopt as so
+from seaopt.problem.stages import fit_problem
+from seaopt.reporting.sections import judge
+from seaopt.reporting.sections.data import Commands
+from tests.actuator_logs import write_csv
+from tests.estimation.judgement.test_late_or_damped import DAMPER, record
+
+PROBLEM = """\
+schema = 1
+
+[parameters]
+N = 100
+K_tau = 0.037
+J_m = { value = 3e-5, free = true }
+b_r = { value = 1.5e-4, free = true }
+f_c = { value = 0.004, free = true }
+v_s = 1.0
+k_s = { value = 240, free = true }
+c_s = 0
+
+[plant.held]
+kind = "rotary"
+link = "locked"
+
+[[experiment]]
+name = "chirp"
+plant = "held"
+log = "chirp.csv"
+[experiment.inputs]
+I = "I [A]"
+[experiment.outputs]
+tau_s = "tau_s [N m]"
+theta_m = "theta_m [rad]"
+"""
+
+
+def write_under(text, advice):
+    """Return a file with lines where an advice says, in place of lines of the same name."""
+    said, *lines = advice.splitlines()
+    (header,) = re.findall(r"write under (\[\S+\])", said)
+    anchor = f'log = "{said.split()[3].rstrip(",")}.csv"' if header == "[[experiment]]" else header
+    assert text.count(anchor) == 1
+    for line in lines:
+        ((name, _),) = tomllib.loads(line).items()
+        text = re.sub(rf"(?m)^{name}\s*=.*\n", "", text)
+        text = text.replace(anchor, f"{anchor}\n{line}")
+    return text
+
+
+@pytest.mark.parametrize(("damper", "delay"), [(DAMPER, 1)])
+def test_what_comes_next_is_written_as_it_stands(tmp_path, damper, delay):
+    log, path = record(damper=damper, delay=delay), tmp_path / "held.toml"
+    columns = {"time [s]": log.time, "I [A]": log["I"], "tau_s [N m]": log["tau_s"], "theta_m [rad]": log["theta_m"]}
+    write_csv(tmp_path / "chirp.csv", columns)
+    text = PROBLEM
+    path.write_text(text, encoding="utf-8")
+    problem = so.read_problem(path)
+    fit = fit_problem(problem)
+    assert not fit.met
+    for advice in judge(fit, Commands(plants=tuple(problem.plants))).next:
+        text = write_under(text, advice)
+    path.write_text(text, encoding="utf-8")
+    mended = so.read_problem(path)
+    fit = fit_problem(mended)
+    assert fit.met
+    assert fit.parameters["c_s"].value == pytest.approx(damper, rel=0.01)
