@@ -249,7 +249,7 @@ def plan_bring_up(
         problem = session.problem if law is controller else _stand_still(session.problem, law)
         if isinstance(law, ForceMPC):
             return certify_problem(replace(problem, mpc=law.spec), linear_controller(law), source)
-        return certify_problem(problem, law, source)
+        return certify_problem(problem, law, source, large_signals=law is controller)
 
     session.warn_of_design(session.problem.certified_plants().values())
     target = folder / BRING_UP

@@ -343,6 +343,7 @@ def certify_problem(
     progress: Progress = ignore,
     executor: Executor | None = None,
     simulations: bool = True,
+    large_signals: bool = True,
 ) -> Certificate:
     """Certify a controller or schedule on the problem's plants, simulations included, as `seaopt certify` does.
 
@@ -354,7 +355,7 @@ def certify_problem(
         The law, which knows its design plant.
     source : Fit or ParameterSet
         The fit; or values, of a problem without experiments.
-    progress, executor, simulations
+    progress, executor, simulations, large_signals
         As in `seaopt.certify`; without all simulations sensors and rounding are not simulated.
     """
     table, plants, measured = problem.robustness, problem.certified_plants(), problem.measure_responses(source)
@@ -382,6 +383,7 @@ def certify_problem(
         bound_tolerance=table.bound_tolerance,
         bounds=Budget() if table.bounds else None,
         simulations=simulations,
+        large_signals=large_signals,
         sensors=problem.sensors.of(read) if simulations else None,  # the file may name those of its other laws
         command_step=table.step if simulations else 0.0,
         measured=measured,

@@ -43,6 +43,13 @@ def test_the_stages_lead_up_to_the_full_law_and_each_is_certified(plan, controll
     assert all(stage.certificate.controller is stage.controller for stage in plan.stages)
 
 
+def test_stages_before_the_last_leave_out_the_sweeps_of_which_nothing_is_required(plan):
+    stage = plan.stages[0]
+    assert not stage.certificate.simulated.large_signal and plan.stages[-1].certificate.simulated.large_signal
+    swept = so.certify(stage.controller, {"stand": so.plants.high_impedance()}, so.plants.thor(), samples=20)
+    assert swept.simulated.large_signal and swept.requirements == stage.certificate.requirements
+
+
 def test_what_is_played_stays_within_its_share_of_current_and_force(plan, compiler, tmp_path):
     for stage in plan.stages:
         bench = Bench(compiler, tmp_path, stage.controller, stage.name)

@@ -101,7 +101,8 @@ class Survey:
     place: tuple[str, float] | None = None  # a schedule's variable and its value; draws are then judged together
     point: bool = True  # whether the law was tuned for just this
     steps: bool = True  # whether steps are simulated,
-    simulations: bool = True  # and all scenarios
+    simulations: bool = True  # and all scenarios,
+    large_signals: bool = True  # with sweeps of amplitudes
     sensors: Sensors | None = None
     measured: Mapping[str, MeasuredResponse] = field(default_factory=dict[str, MeasuredResponse])
     executor: Executor | None = None

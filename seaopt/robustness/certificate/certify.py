@@ -74,6 +74,7 @@ def certify(
     bound_tolerance: float = 0.1,
     bounds: Budget | None = None,
     simulations: bool = True,
+    large_signals: bool = True,
     sensors: Sensors | None = None,
     command_step: float = 0.0,
     measured: Mapping[str, MeasuredResponse] | None = None,
@@ -134,6 +135,8 @@ def certify(
         Play every scenario on the nonlinear plants, with large signals, passivity and environments, as
         `Certificate.with_simulation` does, of a schedule at its points and in sweeps. False plays steps of several
         sizes alone, which takes a few seconds less; so does predictive control, beside its runs.
+    large_signals : bool
+        With the simulations, sweep amplitudes for the curve of bandwidth against them, of which nothing is required.
     sensors, command_step
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     measured : mapping of name to MeasuredResponse, optional
@@ -193,7 +196,8 @@ def certify(
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
-    require_type(simulations, bool, "simulations", "give True or False", ControlError)
+    for name, value in (("simulations", simulations), ("large_signals", large_signals)):
+        require_type(value, bool, name, "give True or False", ControlError)
     require_type(sensors, (Sensors, NoneType), "sensors", "give Sensors", ControlError)
     require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
     check_executor(executor, ControlError)
@@ -212,6 +216,7 @@ def certify(
         others=others,
         options=options,
         simulations=simulations and not isinstance(subject, ForceMPC),
+        large_signals=large_signals,
         sensors=sensors,
         executor=executor,
     )

@@ -142,6 +142,7 @@ def measure_simulations(survey: Survey, progress: Progress) -> Evidence:
         draws=list_worst_draws(models, unknown.nominal, unknown.varied(), survey.found["worst"]),
         seed=survey.options.seed,
         steps=steps if isinstance(steps, Verification) else None,
+        large_signals=survey.large_signals,
         executor=survey.executor,
         progress=progress,
         **survey.devices,
@@ -197,6 +198,7 @@ def run_simulations(
     command_step: float = 0.0,
     seed: int = 1,
     steps: Verification | None = None,
+    large_signals: bool = True,
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> Simulated:
@@ -208,6 +210,8 @@ def run_simulations(
         As in `verify`; the controller knows its design plant.
     steps : Verification, optional
         Runs of steps that were played before: on the same devices they are not played again.
+    large_signals : bool
+        Whether amplitudes are swept.
     executor : concurrent.futures.Executor, optional
         As in `verify`.
     progress : callable, optional
@@ -230,7 +234,7 @@ def run_simulations(
     check_plants(plants, draws or {}, {})
     check_sensors(sensors, controller, plants)
     devices: dict[str, Any] = {"sensors": sensors or Sensors(), "command_step": command_step, "seed": seed}
-    sweeps = _list_sweeps(controller, plants, parameters)
+    sweeps = _list_sweeps(controller, plants, parameters) if large_signals else {}
     jobs = sweeps | _list_port_jobs(controller)
     sweeping, playing = divide(progress, SWEEP * len(sweeps) + PORT, SCENARIOS * len(plants))
     attempts = map_ordered(_attempt, jobs.values(), executor)
