@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,19 @@ def made(tmp_path_factory) -> Path:
     for k in range(LOGS):
         write_log(folder / "logs" / f"r{k // 4}_j{k % 4}.csv", k, J=3.31e-6 * (1.0 + 0.01 * k))
     return folder
+
+
+@pytest.fixture(scope="session")
+def undisturbed(made):
+    """Return what comes of all logs where nothing goes wrong."""
+    with ThreadPoolExecutor(1) as executor:
+        return so.fit_fleet(made / "stand.toml", [made / "logs/*.csv"], executor=executor)
+
+
+@pytest.fixture(scope="session")
+def limit_s(undisturbed) -> float:
+    """Return a time limit that no healthy log reaches, however busy the machine: three times the slowest, or 5 s."""
+    return float(np.ceil(max(5.0, 3.0 * undisturbed.rows["total_s"].max())))
 
 
 @pytest.fixture

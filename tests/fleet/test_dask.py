@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -75,12 +74,6 @@ def list_workers(address):
         return list(client.run(os.getpid).values())
 
 
-@pytest.fixture(scope="module")
-def undisturbed(made):
-    with ThreadPoolExecutor(1) as executor:
-        return so.fit_fleet(made / "stand.toml", [made / "logs/*.csv"], executor=executor)
-
-
 def local(rows):
     return rows.with_columns(pl.col("log").str.replace(r"trouble://\w+/", "/"))
 
@@ -92,7 +85,9 @@ def wait_for_rows(out, process):
         time.sleep(0.05)
 
 
-def test_the_same_table_from_a_cluster_also_where_a_log_kills_workers(made, tmp_path, undisturbed, monkeypatch):
+def test_the_same_table_from_a_cluster_also_where_a_log_kills_workers(
+    made, tmp_path, undisturbed, limit_s, monkeypatch
+):
     paths = sorted((made / "logs").glob("*.csv"))
     monkeypatch.setenv("PYTHONPATH", SITE)
     # Dask itself would give a log to four workers, one after another, each time the fleet tries it.
@@ -100,7 +95,7 @@ def test_the_same_table_from_a_cluster_also_where_a_log_kills_workers(made, tmp_
         list_workers(address)
         with connect_dask(address) as executor:
             logs = [f"trouble://kill{paths[0]}", f"trouble://hang{paths[1]}", *paths[2:]]
-            fleet = so.fit_fleet(made / "stand.toml", logs, executor=executor, time_limit_s=6.0)
+            fleet = so.fit_fleet(made / "stand.toml", logs, executor=executor, time_limit_s=limit_s)
     bad = fleet.rows.filter(pl.col("status") == "failed")
     assert sorted(bad["log"]) == sorted(logs[:2])
     compare(fleet.rows.filter(pl.col("status") != "failed"), undisturbed.rows[2:])

@@ -35,12 +35,6 @@ def troubled(monkeypatch):
     register_implementation("trouble", "tests.fleet.trouble.Trouble", clobber=True)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(made):
-    with ThreadPoolExecutor(1) as executor:
-        return so.fit_fleet(made / "stand.toml", [made / "logs/*.csv"], executor=executor)
-
-
 def disturb(what, path):
     return f"trouble://{what}{path}"
 
@@ -80,15 +74,15 @@ def test_a_log_that_kills_its_worker_is_blamed_alone(made, troubled, undisturbed
 
 
 @pytest.mark.slow
-def test_a_log_that_hangs_is_stopped_also_where_python_cannot(made, troubled):
+def test_a_log_that_hangs_is_stopped_also_where_python_cannot(made, troubled, limit_s):
     paths = sorted((made / "logs").glob("*.csv"))
     logs = [disturb("hang", paths[0]), disturb("lock", paths[1]), paths[2]]
     with Processes(2) as executor:
-        fleet = so.fit_fleet(made / "stand.toml", logs, executor=executor, time_limit_s=5.0)
+        fleet = so.fit_fleet(made / "stand.toml", logs, executor=executor, time_limit_s=limit_s)
     reasons = dict(zip(fleet.rows["log"], fleet.rows["reason"], strict=True))
     assert reasons[str(paths[2])] is None
-    assert reasons[logs[0]].startswith("takes longer than the time limit of 5 s")
-    assert "died" in reasons[logs[1]] and "time limit of 5 s" in reasons[logs[1]]
+    assert reasons[logs[0]].startswith(f"takes longer than the time limit of {limit_s:g} s")
+    assert "died" in reasons[logs[1]] and f"time limit of {limit_s:g} s" in reasons[logs[1]]
 
 
 class Deadly(Executor):

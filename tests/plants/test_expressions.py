@@ -142,9 +142,9 @@ def test_the_line_of_a_long_text_is_shown():
      "if_else(" * 1000, "min(x, " * 1200, "2*(x+" * 1500, "9" * 1_000_000],
 )  # fmt: skip
 def test_no_text_exhausts_the_stack_or_takes_long(text):
-    start = time.perf_counter()
+    start = time.process_time()
     refused(text)
-    assert time.perf_counter() - start < 2.0
+    assert time.process_time() - start < 2.0
 
 
 def test_a_long_sum_is_read():

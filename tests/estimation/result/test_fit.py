@@ -513,9 +513,9 @@ def test_it_is_quick(stand, stand_log, thor):
     if find_compiler() is None:
         pytest.skip("no C compiler")
     so.fit([experiment(stand, stand_log)], thor.free(*FREE))
-    started = time.perf_counter()
+    started = time.process_time()
     so.fit([experiment(stand, stand_log)], thor.free(*FREE))
-    assert time.perf_counter() - started < 10
+    assert time.process_time() - started < 10
 
 
 def test_guesses_are_counted_and_named():
