@@ -288,10 +288,20 @@ def find_modes(law: RunnableLaw, limited: Bool[np.ndarray, " n"]) -> Float[np.nd
     """Return what each state at the first row adds to the later commands, with the limit as logged."""
     rows, moved = np.empty((limited.size, law.c.size)), np.eye(law.c.size)
     ways = law.a, law.a - np.outer(law.anti_windup, law.c)
-    for k, at_limit in enumerate(limited.tolist()):
-        rows[k] = law.c @ moved
-        moved = ways[at_limit] @ moved
+    stretches = np.split(np.arange(limited.size), np.flatnonzero(np.diff(limited)) + 1) if limited.size else []
+    for part in stretches:
+        way = ways[int(limited[part[0]])]
+        rows[part] = _list_powers(law.c, way, part.size) @ moved
+        moved = np.linalg.matrix_power(way, part.size) @ moved
     return law.per_effort * rows
+
+
+def _list_powers(row: Float[np.ndarray, " m"], way: Float[np.ndarray, "m m"], count: int) -> Float[np.ndarray, "n m"]:
+    """Return a row times each power of a matrix, twice as many at each step."""
+    rows = row[None]
+    while len(rows) < count:
+        rows, way = np.concatenate([rows, rows[: count - len(rows)] @ way]), way @ way
+    return rows
 
 
 def follow(

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import Gains
+from seaopt.control import Gains, runnable
 from seaopt.machine.excitation import design_excitation
+from seaopt.machine.stepped import find_modes
 from tests.machine.conftest import SPEC
 from tests.machine.simulator import Bench, Machine, multisine
 
@@ -34,6 +35,19 @@ def cause_of(controller, log, **options):
 def test_the_exported_law_is_replayed_to_the_last_digits(controller, bench, noise):
     (row,) = so.accept(controller, [bench.log(Machine(), REFERENCE, noise=noise)]).replays
     assert row.met and row.mismatch < 1e-12 and row.command_late == 0 and row.causes == ()
+
+
+def test_what_a_state_adds_to_the_commands_is_what_steps_add(controller):
+    """Of rows whose command is at its limit, now and then, and of none."""
+    law = runnable(controller)
+    limited = np.repeat([False, True, False, True], [700, 30, 1, 69])
+    states, expected = np.eye(law.c.size), []
+    for at_limit in limited:
+        effort = law.c @ states
+        expected.append(law.per_effort * effort)
+        states = law.a @ states - at_limit * np.outer(law.anti_windup, effort)
+    np.testing.assert_allclose(find_modes(law, limited), expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
+    assert find_modes(law, limited[:0]).shape == (0, law.c.size)
 
 
 @pytest.mark.parametrize("decimals", [None, 2, 0])
@@ -138,7 +152,6 @@ def test_another_law_and_another_limit_are_named(compiler, tmp_path, controller)
 
 def test_a_missing_feedforward_is_named(compiler, tmp_path, controller):
     gains = {name: controller.gains[name] for name in ("k_p", "k_i", "k_d", "T_f", "c")}
-    from seaopt.control import Gains
 
     law = Gains(**gains, k_r=controller.gains["k_p"]).law("pid", 1e-3).balanced()
     custom = replace(controller, law=law, structure="custom", gains={}, spec=replace(SPEC, structure="custom"))
@@ -229,7 +242,6 @@ SLOW = np.unique(np.round(np.geomspace(1, 45, 20)).astype(int))
 @pytest.fixture(scope="module")
 def halved(compiler, tmp_path_factory, controller):
     """Return the benches of the law with each gain at half its size."""
-    from seaopt.control import Gains
 
     gains, folder = Gains.from_names(controller.gains), tmp_path_factory.mktemp("halved")
     benches = {}
@@ -281,7 +293,6 @@ def test_long_logs_of_every_tenth_tick_name_a_halved_derivative_a_weak_drive_and
 
 @pytest.mark.parametrize("every", [2, 10])
 def test_a_law_with_another_part_is_refuted_or_named_beside_this_law(controller, compiler, tmp_path, bench, every):
-    from seaopt.control import Gains
 
     law = replace(Gains.from_names(controller.gains), T_f=0.5 * controller.gains["T_f"]).law("pid", 1e-3).balanced()
     custom = replace(controller, law=law, structure="custom", gains={}, spec=replace(SPEC, structure="custom"))
