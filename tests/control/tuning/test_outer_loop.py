@@ -25,6 +25,7 @@ from seaopt.control.tuning.optimisation_problem import SCOPES, Task
 from seaopt.control.tuning.tuner import make_task
 from seaopt.errors import ControlError
 from seaopt.progress import ignore
+from tests.hand_loops import find_peaks, respond
 
 TS, T_V = 1e-3, 5e-3
 HELD, KNEE, FREE = (so.plants.rotary(link) for link in ("locked", "pendulum", "free"))
@@ -95,14 +96,8 @@ def close_by_hand(law, moving, signals, gain, around, sigma, waits=1):
     return control.ss(rows, into, effort[None], np.ones((1, 1)), TS)
 
 
-def find_peak(hand, curve):
-    """Return the peak of a curve of the sensitivity, the grid about it twice refined."""
-    f = np.union1d(np.geomspace(1e-3, 499.9, 700), np.abs(np.angle(hand.poles())) / (2 * np.pi * TS))
-    for _ in range(3):
-        size = np.abs(curve(hand(np.exp(2j * np.pi * f * TS))))
-        k = int(np.argmax(size))
-        f = np.linspace(f[max(k - 1, 0)], f[min(k + 1, f.size - 1)], 60)
-    return np.max(size)
+def find_ms_and_mt(hand):
+    return find_peaks(hand, lambda s: s, lambda s: 1.0 - s)
 
 
 @cache
@@ -161,15 +156,15 @@ def test_curves_figures_and_stability_are_those_of_the_loop_by_hand(name):
         assert np.max(np.abs(loop.eigenvalues())) == pytest.approx(radius, abs=2e-8)
         grid = task.grid(f)
         at = task.respond(grid, x)
-        np.testing.assert_allclose(1.0 / grid.plants.at(1).add_up(at.c_y, at.c_v, at.c_r), hand(z), rtol=2e-6)
+        np.testing.assert_allclose(1.0 / grid.plants.at(1).add_up(at.c_y, at.c_v, at.c_r), respond(hand, z), rtol=2e-6)
         held = grid.plants.at(0)
         np.testing.assert_array_equal(held.add_up(at.c_y, at.c_v, at.c_r), held.alone.add_up(at.c_y, at.c_v, at.c_r))
         if radius < 1.0 - 1e-6:
             stable += 1
             found = loop.figures()
-            assert found.ms == pytest.approx(find_peak(hand, lambda s: s), rel=1e-4)
-            assert found.mt == pytest.approx(find_peak(hand, lambda s: 1.0 - s), rel=1e-4)
+            assert (found.ms, found.mt) == pytest.approx(find_ms_and_mt(hand), rel=1e-4)
     assert stable >= 12, stable
+    np.testing.assert_allclose(respond(hand, z), hand(z), rtol=1e-8)  # python-control's own way
 
 
 @cache
@@ -272,7 +267,7 @@ def measure_by_hand(law, around):
     moving, command, sigma, _ = describe_case("knee")
     hand = close_by_hand(law.law, moving, law.signals, command.per_effort, around, sigma)
     assert np.max(np.abs(hand.poles())) < 1.0
-    return find_peak(hand, lambda s: s), find_peak(hand, lambda s: 1.0 - s)
+    return find_ms_and_mt(hand)
 
 
 @pytest.mark.parametrize(
@@ -333,8 +328,7 @@ def test_a_damping_at_a_link_that_nothing_holds_leaves_its_drift_out():
     radii = np.sort(np.abs(hand.poles()))
     assert radii[-1] == pytest.approx(1.0, abs=1e-8) and radii[-2] < 0.9999
     found = close_whole(law, shown, VALUES).figures()
-    assert found.stable and found.ms == pytest.approx(find_peak(hand, lambda s: s), rel=1e-3)
-    assert found.mt == pytest.approx(find_peak(hand, lambda s: 1.0 - s), rel=1e-3)
+    assert found.stable and (found.ms, found.mt) == pytest.approx(find_ms_and_mt(hand), rel=1e-3)
     tuned = so.tune(HELD, VALUES, OF_KNEE, {"free": FREE}, outer=lambda _: law.outer)
     assert tuned.met and tuned.outer == law.outer
 
@@ -350,7 +344,7 @@ def test_a_schedule_keeps_its_limits_with_its_outer_loop():
         assert law.outer == schedule.controllers[0].outer
         v = {name: VALUES[name].value for name in VALUES} | {"k_s": stiffness}
         hand = close_by_hand(law.law, move_knee(v), law.signals, law.command.per_effort, ASKED, 1.0)
-        ms, mt = find_peak(hand, lambda s: s), find_peak(hand, lambda s: 1.0 - s)
+        ms, mt = find_ms_and_mt(hand)
         assert ms <= 1.6 * (1 + 1e-4) and mt <= 1.3 * (1 + 1e-4)
     again = type(schedule).from_dict(schedule.to_dict(), HELD, VALUES, schedule.others)
     assert again.met and [place.broken for place in again.between] == [place.broken for place in schedule.between]
