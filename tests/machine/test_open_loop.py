@@ -10,7 +10,7 @@ from scipy.signal import chirp, cont2discrete, lfilter
 
 import seaopt as so
 from tests.machine.simulator import Machine, multisine
-from tests.machine.test_replay import LINES, REFERENCE, cause_of
+from tests.machine.test_replay import LINES, REFERENCE
 
 N = 6000
 TIME = 1e-3 * np.arange(N)
@@ -36,9 +36,10 @@ def play(current, reference, noise=2.0, decimals=2, seed=1):
 @pytest.mark.parametrize("played", PLAYED)
 def test_a_command_that_was_played_without_the_law_is_an_open_loop(controller, played, reference):
     log = play(PLAYED[played], REFERENCES[reference])
-    cause = cause_of(controller, log)
-    assert (cause.kind, cause.what) == ("open loop", "F1")
-    words = str(so.accept(controller, [log]))
+    result = so.accept(controller, [log])
+    (row,) = result.replays
+    first, words = row.causes[0], str(result)
+    assert not row.met and first.explains and (first.kind, first.what) == ("open loop", "F1"), row
     assert "does not follow F1: the loop was open" in " ".join(words.split()) and "record" in words
 
 

@@ -152,7 +152,6 @@ def test_another_law_and_another_limit_are_named(compiler, tmp_path, controller)
 
 def test_a_missing_feedforward_is_named(compiler, tmp_path, controller):
     gains = {name: controller.gains[name] for name in ("k_p", "k_i", "k_d", "T_f", "c")}
-
     law = Gains(**gains, k_r=controller.gains["k_p"]).law("pid", 1e-3).balanced()
     custom = replace(controller, law=law, structure="custom", gains={}, spec=replace(SPEC, structure="custom"))
     cause = cause_of(controller, Bench(compiler, tmp_path, custom).log(Machine(), REFERENCE))
@@ -242,7 +241,6 @@ SLOW = np.unique(np.round(np.geomspace(1, 45, 20)).astype(int))
 @pytest.fixture(scope="module")
 def halved(compiler, tmp_path_factory, controller):
     """Return the benches of the law with each gain at half its size."""
-
     gains, folder = Gains.from_names(controller.gains), tmp_path_factory.mktemp("halved")
     benches = {}
     for name in ("k_p", "k_i", "k_d"):
@@ -293,7 +291,6 @@ def test_long_logs_of_every_tenth_tick_name_a_halved_derivative_a_weak_drive_and
 
 @pytest.mark.parametrize("every", [2, 10])
 def test_a_law_with_another_part_is_refuted_or_named_beside_this_law(controller, compiler, tmp_path, bench, every):
-
     law = replace(Gains.from_names(controller.gains), T_f=0.5 * controller.gains["T_f"]).law("pid", 1e-3).balanced()
     custom = replace(controller, law=law, structure="custom", gains={}, spec=replace(SPEC, structure="custom"))
     other, reference = Bench(compiler, tmp_path, custom), multisine(1000, SLOW, 12, 60.0, 1, bias=300.0)

@@ -14,7 +14,8 @@ from seaopt.errors import ControlError
 from seaopt.robustness import tune_certified
 from seaopt.robustness.certificate.retuning.relief import Relief, find_relief
 from seaopt.robustness.certificate.retuning.reserve import Look, look_at_draws, raise_reserve
-from tests.control.running.test_fed_back import HELD, KNEE, TS, VALUES, close_by_hand, weigh
+from tests.control.running.test_fed_back import HELD, KNEE, VALUES, close_by_hand, weigh
+from tests.hand_loops import find_peaks
 
 MASSES = (2.7, 3.2)
 SHARE = 1.5  # of the weight, which the outer loop holds
@@ -36,8 +37,8 @@ def look():
 
 def use_limits(loop):
     """Return the share of Ms and Mt that a loop uses, by its sensitivity at the command."""
-    s = loop(np.exp(2j * np.pi * np.geomspace(1e-2, 499.0, 20_000) * TS))[0, 0]
-    return max(np.max(np.abs(s)) / 1.6, np.max(np.abs(1.0 - s)) / 1.3)
+    ms, mt = find_peaks(loop, lambda response: response[0, 0], lambda response: 1.0 - response[0, 0])
+    return max(ms / 1.6, mt / 1.3)
 
 
 def test_a_softer_impedance_keeps_the_limits_and_a_stiffer_one_does_not(force, look):
