@@ -323,7 +323,7 @@ def follow(
 
 def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
     """Return a state from which the first rows match as well as they can."""
-    limited = find_limited(ticks)
+    limited = find_limited(ticks) | (np.abs(ticks.command) >= AT_LIMIT * law.command_limit)  # single rows, too
     if np.count_nonzero(~limited) < 3 * max(law.c.size, 1) or not law.c.size:
         return np.zeros(law.c.size)
     left, weight = ticks.command - follow(law, ticks, limited), 1.0 / allowed[~limited]

@@ -355,3 +355,14 @@ def test_a_part_that_the_whole_log_alone_tells_is_named(compiler, tmp_path):
     (row,) = so.accept(law, [log]).replays
     assert not row.met and 2.0 < row.mismatch / row.allowed < 3.0
     assert (row.causes[0].kind, row.causes[0].what, row.causes[0].explains) == ("part", "disturbance observer", True)
+
+
+def test_a_log_that_begins_amid_single_ticks_at_the_limit_is_of_its_law(controller, bench):
+    """Glitches of the reference that take the command to its limit for a tick each: its anti-windup is in the state."""
+    reference = np.where(np.arange(4000) % 100 == 7, 1.0, 0.0)
+    largest = np.max(np.abs(bench.log(Machine(), reference, noise=0.0)["I"]))
+    run = bench.log(Machine(), 9.3 / largest * reference, noise=0.0)
+    limited = np.flatnonzero(np.abs(run["I"]) >= 9.0 * (1.0 - 1e-6))
+    assert limited.size > 20 and np.all(np.diff(limited) > 1)
+    (row,) = so.accept(controller, [run.between(0.105, 3.9)]).replays
+    assert row.met and row.mismatch < 1e-9 and row.saturated > 0.0
