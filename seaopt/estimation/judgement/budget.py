@@ -2,7 +2,7 @@
 
 It is counted in evaluations. An evaluation takes its integration steps, and about as long as one for the residual of
 each sample and its sums; one that takes many times what the fit's last one took counts for more. Where each counted for
-what it takes, the search would end before it came to bristles that are the cause: they need four to nine times the
+what it takes, the search would end before it came to bristles that are the cause: they need three to nine times the
 fit's, and two of six such actuators were not explained.
 """
 

@@ -523,8 +523,8 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
     tied.sort(key=lambda refit: (refit.evaluation.z.size, refit.excess))
     others = [refit for refit in refits if refit not in tied]
     others.sort(key=lambda refit: (refit.undecided, refit.excess))
-    outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]]]
-    outcomes += ["undecided" if refit.undecided else "tried" for refit in others]
+    left: list[Outcome] = ["undecided" if refit.undecided else "tried" for refit in others]
+    outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]], *left]
     ranked = [*tied, *others]
     trials = tuple(_state(refit, outcome, first) for refit, outcome in zip(ranked, outcomes, strict=True))
     return Search(able=tuple(tied), trials=trials, partial=None if able else find_partial(refits, first, colour))
