@@ -184,6 +184,20 @@ def test_rows_that_are_lost_one_by_one_are_counted_whatever_their_share(share, p
     np.testing.assert_allclose(even.time - even.time[0], true - true[0], atol=1e-4)
 
 
+@pytest.mark.parametrize("std", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("lost", [0, 3])
+def test_no_row_is_lost_by_jitter_alone(std, lost):
+    """Gaussian jitter of which one in ten is nearer another row; and a gap, to the row that jitter allows."""
+    rng = np.random.default_rng(int(100 * std) + lost)
+    index = np.delete(np.arange(20_000), np.arange(9_000, 9_000 + lost))
+    stamps = np.maximum.accumulate(1e-3 * (index + rng.normal(scale=std, size=index.size)))
+    log = so.Log.from_arrays(time=stamps + 1e-12 * np.arange(index.size), F1=index.astype(float))
+    even = log.restamp(rate_hz=1000)
+    off = np.round(1000 * (even.time - even.time[0])) - index
+    assert np.count_nonzero(off) <= (3 if lost else 0), np.flatnonzero(off)
+    assert len(even.segments) == 1 + bool(lost)
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_matlab_4_files_are_read(tmp_path, order):
     rng = np.random.default_rng(2)

@@ -22,7 +22,10 @@ from seaopt.logs.quality.clock import (
 from seaopt.signals import Recording, VectorK, VectorM, VectorN
 
 AROUND = 20  # samples ahead that tell a gap from a late stamp
-PHASED = 50  # samples of a part that has one phase
+PHASED = 200  # samples of a part that has one phase
+LEVELS = 5  # numbers of lost samples that are thought of at a row, from one below the least ahead on
+MOST_LATE = 0.5  # periods, of which a late stamp is counted as off: less than an early one, which is rarer
+RISE = 0.25  # periods that rows have to be off in all before a sample is missing
 PARTS = 20  # of a log, whose medians tell the rate at which the timestamps run
 MOST_DRIFT = 5e-3  # of a stated rate, as of a ceramic resonator: a sampling clock that is further off has another rate
 RESOLVED = 5.0  # standard deviations of the drift's slope: less is jitter
@@ -214,17 +217,49 @@ def _restamp_at(log: Recording, mean_period: float, rate_hz: float) -> tuple[Vec
 
 def _count_lost(late: VectorN) -> VectorN:
     """Return how many samples are missing before each. `late`: by how many periods each is stamped later than its row
-    says. It is a whole number, a phase that drifts slowly, and jitter: the phase is the circular mean of parts, one
-    after another. What is stamped late comes back, what is missing never does: the least of those ahead counts.
+    says. It is a whole number that never falls, a phase that drifts slowly, and jitter. What is stamped late comes
+    back, so that the number is near the least of those ahead; it rises where that costs least: the sum of what each row
+    is off, for one that is late `MOST_LATE` at most and for an early one a whole, and `RISE` for each rise.
     """
-    parts = np.array_split(np.arange(late.size), max(late.size // PHASED, 1))
-    turns = np.array([np.angle(np.mean(np.exp(2j * np.pi * late[rows]))) for rows in parts])
-    middles = np.array([np.mean(rows) for rows in parts])
-    phase = np.interp(np.arange(late.size), middles, np.unwrap(turns) / (2.0 * np.pi))
-    whole = np.round(late - phase)
-    ahead = np.lib.stride_tricks.sliding_window_view(np.append(whole, np.full(AROUND, np.inf)), AROUND + 1)
-    least = np.maximum.accumulate(np.min(ahead, axis=1))
-    return least - least[0]
+    off = late - _follow_phase(late)
+    ahead = np.lib.stride_tricks.sliding_window_view(np.append(off, np.full(AROUND, np.inf)), AROUND + 1)
+    base = np.maximum.accumulate(np.round(np.min(ahead, axis=1))) - 1.0
+    misfits = np.abs(np.clip(off[:, None] - base[:, None] - np.arange(LEVELS), -1.0, MOST_LATE))
+    costs, came = misfits[0].tolist(), np.zeros(misfits.shape, dtype=np.int64)
+    for row, (moved, misfit) in enumerate(zip(np.diff(base, prepend=base[0]).tolist(), misfits.tolist(), strict=True)):
+        if row == 0:
+            continue
+        moved, lowest = int(moved), min(range(min(int(moved), LEVELS)), key=costs.__getitem__, default=-1)
+        before, costs = costs, []
+        for level in range(LEVELS):
+            same = level + moved
+            stayed = before[same] if same < LEVELS else np.inf
+            risen = before[lowest] + RISE if lowest >= 0 else np.inf
+            came[row, level] = same if stayed <= risen else lowest
+            costs.append(misfit[level] + min(stayed, risen))
+            if same < LEVELS and (lowest < 0 or before[same] < before[lowest]):
+                lowest = same
+    level = int(np.argmin(costs))
+    lost = np.empty_like(late)
+    for row in range(late.size - 1, -1, -1):
+        lost[row] = base[row] + level
+        level = int(came[row, level])
+    return lost - lost[0]
+
+
+def _follow_phase(late: VectorN) -> VectorN:
+    """Return the part of a period by which stamps are late, row by row, however many whole ones: its mean rate is the
+    peak of a spectrum on the circle, where whole periods do not count; what is left of it the circular mean of parts.
+    """
+    rows, turns = np.arange(late.size), np.exp(2j * np.pi * late)
+    size, drifts = np.abs(np.fft.fft(turns)), np.fft.fftfreq(late.size)
+    slow = np.abs(drifts) <= MOST_DRIFT
+    size[slow] *= 2.0  # a rate that is further off than clocks are has to be plain
+    line = drifts[np.argmax(size)] * rows
+    turns *= np.exp(-2j * np.pi * line)
+    parts = np.array_split(rows, max(late.size // PHASED, 1))
+    phases = np.unwrap([np.angle(np.mean(turns[part])) for part in parts]) / (2.0 * np.pi)
+    return line + np.interp(rows, [np.mean(part) for part in parts], phases)
 
 
 def _measure_drift(line: VectorN, off: VectorN) -> tuple[float, float]:
