@@ -37,7 +37,7 @@ from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from functools import lru_cache
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -128,11 +128,18 @@ def _digest(content: bytes) -> str:
 
 def _find_whole(folder: Path, key: str) -> Path | None:
     """Return the library of a key whose content has the hash in its name."""
-    for library in folder.glob(f"{key}.*.so"):
+    listed = _list_libraries(folder).get(key)
+    for library in chain([] if listed is None else [folder / listed], folder.glob(f"{key}.*.so")):
         with suppress(OSError):
             if library.name == f"{key}.{_digest(library.read_bytes())}.so":
                 return library
     return None
+
+
+@lru_cache(maxsize=8)
+def _list_libraries(folder: Path) -> dict[str, str]:
+    """Return what was in a folder by key: it may hold thousands, and looking through them takes milliseconds."""
+    return {path.name.partition(".")[0]: path.name for path in folder.glob("*.so")}
 
 
 @lru_cache(maxsize=1)
