@@ -250,11 +250,16 @@ def test_what_is_asked_of_the_design_plant_alone_is_asked_of_the_force_law():
     assert abs(loop.figures.mt - force_alone.figures.mt) > 0.01
 
 
-def tune_knee(around, spec=OF_KNEE, **options):
+def tune_knee(around, spec=OF_KNEE):
     """Return a law tuned with the impedance, and that with it which was tuned without."""
     complete = partial(give_outer, around)
-    with_it = so.tune(HELD, VALUES, spec, {"knee": KNEE}, outer=lambda law: complete(law).outer, **options)
-    return with_it, complete(so.tune(HELD, VALUES, spec, {"knee": KNEE}, **options))
+    with_it = so.tune(HELD, VALUES, spec, {"knee": KNEE}, outer=lambda law: complete(law).outer)
+    return with_it, complete(tune_alone(spec))
+
+
+@cache
+def tune_alone(spec):
+    return so.tune(HELD, VALUES, spec, {"knee": KNEE})
 
 
 def give_outer(around, law):
