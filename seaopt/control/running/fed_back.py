@@ -41,33 +41,56 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import SLIDING, friction_states, name_states
 from seaopt.plants.memo import memo
+from seaopt.records import record
 
 WEIGHT, AGAINST = "weight compensated", "friction compensated"  # outputs: of the link's position, of the motor's
 SHORT = 1e-4  # of a weight that is compensated whole
 TURNED = "motor_turned"  # a state, of the motor's place
 
 
+@record
+class LaterTerms:
+    """The terms at the end of a stretch of a schedule's variable, a parameter, over which their numbers are lines."""
+
+    terms: Compensation
+    over: str
+    low: float  # low, high: the ends of the stretch
+    high: float
+
+    def share(self, p: Any) -> Any:
+        """Return the share of the way to the end, of a plant's parameters."""
+        return (getattr(p, self.over) - self.low) / (self.high - self.low)
+
+
 def split_states(
-    controller: Controller, plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()
+    controller: Controller,
+    plants: Mapping[str, Plant],
+    params: ParameterSet,
+    varied: Collection[str] = (),
+    later: LaterTerms | None = None,
 ) -> dict[str, Plant]:
     """Return what `split_friction` does, each plant with what the controller's terms and its outer loop feed back of
-    it.
+    it; with `later` terms those on the way from the controller's.
     """
     terms, outer, split = controller.compensation, controller.outer, dict[str, Plant]()
     for label, (name, state) in name_states(plants, params, varied).items():
         plant = friction_states(plants[name])[state] if state else plants[name]
         plant = plant if outer is None else show_position(plant, outer, controller.signals)
-        split[label] = plant if terms is None else _show_terms(plant, terms, controller.signals, state != SLIDING)
+        split[label] = (
+            plant if terms is None else _show_terms(plant, terms, controller.signals, state != SLIDING, later)
+        )
     return split
 
 
 @memo
-def _show_terms(plant: Plant, terms: Compensation, signals: tuple[str, ...], stands: bool) -> Plant:
+def _show_terms(
+    plant: Plant, terms: Compensation, signals: tuple[str, ...], stands: bool, later: LaterTerms | None
+) -> Plant:
     """Return a plant with outputs of what terms feed back of it; the plant itself where they feed back nothing."""
     gravity, friction, units, forgets = terms.gravity, terms.friction, dict[str, str](), False
+    first, last = _shorten(terms), _shorten(terms if later is None else later.terms)
     if gravity is not None and {gravity.reads, *signals} <= plant.outputs.keys():
         units[WEIGHT] = plant.outputs[signals[0]]
-        gravity = gravity.scaled(1.0 - SHORT) if gravity.fraction == 1.0 else gravity
     if friction is not None and stands and friction.reads in plant.outputs:
         units[AGAINST] = plant.outputs[friction.reads]
         forgets = friction.reads not in leave_out_drift(plant, signals).outputs
@@ -75,18 +98,26 @@ def _show_terms(plant: Plant, terms: Compensation, signals: tuple[str, ...], sta
         return plant
 
     def h(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
-        read, shown = plant.h(t, x, u, p), dict[str, Any]()
+        read, shown, share = plant.h(t, x, u, p), dict[str, Any](), 0.0 if later is None else later.share(p)
+        numbers = [a if a == b else a + share * (b - a) for a, b in zip(first.numbers, last.numbers, strict=True)]
         if WEIGHT in units and gravity is not None:
-            weight = Compensation(sample_time_s=terms.sample_time_s, gravity=gravity)
-            shown[WEIGHT] = compensate(weight.shape, weight.numbers, (), 0.0, [read[gravity.reads]], ca)[0]
+            weight, at = replace(terms, friction=None, ripple=None).shape, 0 if friction is None else 2
+            series = numbers[at : at + weight.size]
+            shown[WEIGHT] = compensate(weight, series, (), 0.0, [read[gravity.reads]], ca)[0]
         if AGAINST in units and friction is not None:
             turned = getattr(x, TURNED) if forgets else read[friction.reads]
-            shown[AGAINST] = friction.effort * friction.share_per_step(terms.sample_time_s) * turned
+            shown[AGAINST] = numbers[0] * numbers[1] * turned
         return {**read, **shown}
 
     if friction is not None and forgets:
         plant = add_forgetful(plant, friction.reads, FORGOTTEN / terms.sample_time_s, TURNED)
     return replace(plant, h=h, outputs={**plant.outputs, **units})
+
+
+def _shorten(terms: Compensation) -> Compensation:
+    """Return terms of which a weight that is compensated whole is so with `SHORT` less."""
+    gravity = terms.gravity
+    return terms if gravity is None or gravity.fraction != 1.0 else replace(terms, gravity=gravity.scaled(1.0 - SHORT))
 
 
 def feeds_back(controller: Controller, plant: Plant) -> bool:

@@ -9,22 +9,6 @@ and beyond the ends it stays. The gains are those of `seaopt.control.laws.struct
 step order with states that mean the same everywhere (`seaopt.control.scheduling.step_order`); matrices of a balanced
 realisation have coordinates of their own at every point, and cannot be interpolated. A corner f is interpolated as the
 filter has it, :math:`\tan \pi f T_s`.
-
-**How much the law changes.** With :math:`\bar s` the middle of a stretch between two points, h its half width and a
-dash for a slope,
-
-.. math::
-    C_y(s) - C_y(\bar s) = (s - \bar s)\,(k_p' + k_i' I + k_d' D(\bar s)) + k_d(s)\,(D(s) - D(\bar s)), \qquad
-    \Big|\frac{\partial D}{\partial T_f}\Big| = \frac{|1 - q|^2}{|T_s + T_f (1 - q)|^2} .
-
-The real part of 1 - q is not negative, so that this derivative is largest where T_f is smallest, and
-
-.. math::
-    |C_y(s) - C_y(\bar s)| \le h\,|k_p' + k_i' I + k_d' D(\bar s)|
-        + \max k_d \; h\,|T_f'|\,\max \Big|\frac{\partial D}{\partial T_f}\Big|
-
-holds at every frequency for the whole stretch, which `bound_change` returns over :math:`|C_y(\bar s)|`. There is no
-such rule yet for a notch, an observer, a cascade and a link's feedforward, whose change is not bounded.
 """
 
 from __future__ import annotations
@@ -50,7 +34,6 @@ from seaopt.control.laws.structures import (
     Nominal,
     SpeedLoop,
     Structure,
-    evaluate_terms,
 )
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.law import Law
@@ -222,28 +205,6 @@ class GainTable:
     def law(self, value: float) -> Law:
         """Return the law while the variable stands at a value."""
         return self.find_gains(value).law(self.structure, self.sample_time_s).balanced()
-
-    def bound_change(self, low: float, high: float, f: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-        """Return what abs(C_y(s)/C_y(middle) - 1) stays below for every s from low to high, at frequencies in Hz.
-        Infinite where there is no rule for a part of the law. Raises ControlError: a point of the table lies between
-        the two.
-        """
-        if np.any((self.points > low) & (self.points < high)):
-            raise ControlError(f"a stretch from {low:g} to {high:g} has a point of the table in it; end it there")
-        if self.speed is not None or self.nominals or self.links or NOTCH_GAINS[0] in self.gains:
-            return np.full(f.size, np.inf)
-        ts, half = self.sample_time_s, 0.5 * (high - low)
-        first, last, middle = (self.interpolate(value) for value in (low, high, 0.5 * (low + high)))
-        width = max(high - low, np.finfo(float).tiny)
-        slope = {name: (last[name] - first[name]) / width for name in LAW_GAINS}
-        q = np.exp(-2j * np.pi * f * ts)
-        terms = evaluate_terms(q, ts, middle["T_f"])
-        integral = terms.integral if self.integrates else 0.0
-        least_filter = min(first["T_f"], last["T_f"])
-        filtering = np.abs((1.0 - q) / (ts + least_filter * (1.0 - q))) ** 2 * half * abs(slope["T_f"])
-        change = half * np.abs(slope["k_p"] + slope["k_i"] * integral + slope["k_d"] * terms.rate)
-        change = change + max(first["k_d"], last["k_d"]) * filtering
-        return change / np.abs(middle["k_p"] + middle["k_i"] * integral + middle["k_d"] * terms.rate)
 
 
 @lru_cache(maxsize=16)

@@ -200,15 +200,18 @@ class ScheduledController(Result, Worded):
         else:
             spec, first = replace(self.spec, bandwidth_hz=self.asked_hz(value)), self.controllers[0]
             frozen = freeze(self.table, value, spec, self.design, self.others, self.outer)
-            (i, t), terms = self.table.find_stretch(value), [each.compensation for each in self.controllers]
-            low, high = terms[i], terms[i + 1]
-            mixed = None if low is None or high is None else low.mix(high, t)
             kept = {"gate": first.gate, "derate": first.derate}
-            frozen = replace(frozen, compensation=mixed, **kept)
+            frozen = replace(frozen, compensation=self.terms_at(value), **kept)
         if value in self.points and not self.table.nominals:
             return frozen
         share = self.table.find_numbers(value, **{SHARE: self.runnable().anti_windup})[SHARE]
         return replace(frozen, share=share)
+
+    def terms_at(self, value: float) -> Compensation | None:
+        """Return what it compensates at a value, between the points interpolated."""
+        i, t = self.table.find_stretch(value)
+        low, high = (each.compensation for each in self.controllers[i : i + 2])
+        return low if low is None or high is None or low == high else low.mix(high, t)
 
     def close_points(self, plant: Plant, params: ParameterSet) -> tuple[Loop, ...]:
         """Return a plant's loop at each point, with the variable standing still there."""

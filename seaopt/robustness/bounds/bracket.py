@@ -26,8 +26,16 @@ from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.impulse import ImpulseTransfer, enclose_plant
 from seaopt.robustness.bounds.region import Boxes, Region, Rows, build_region
-from seaopt.robustness.bounds.unit_circle import ArcBounds, Arcs, bound_arcs
-from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.robustness.bounds.scheduled_law import ScheduledLaw
+from seaopt.robustness.bounds.unit_circle import (
+    ArcBounds,
+    Arcs,
+    LawPolynomials,
+    bound_arcs,
+    expand_controller,
+    expand_nothing,
+)
+from seaopt.robustness.uncertainty.batch import BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Points, Uncertainty
 from seaopt.robustness.uncertainty.rows import join_rows, take_rows
 from seaopt.robustness.uncertainty.severity import severities
@@ -123,6 +131,8 @@ class _BranchAndBound:
 
     controller: Controller
     plant: Plant
+    scheduled: ScheduledLaw | None
+    law: LawPolynomials
     within: Region
     tolerance: float
     boxes: Boxes
@@ -138,7 +148,12 @@ class _BranchAndBound:
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite is no bound
 def bracket(
-    controller: Controller, plant: Plant, unknown: Uncertainty, worst: Worst | None = None, budget: Budget | None = None
+    controller: Controller,
+    plant: Plant,
+    unknown: Uncertainty,
+    worst: Worst | None = None,
+    budget: Budget | None = None,
+    scheduled: ScheduledLaw | None = None,
 ) -> Bracket:
     """Bound the worst Ms and Mt over the set of `find_worst` from above, and find whether all its plants are stable.
 
@@ -150,6 +165,8 @@ def bracket(
         The worst case known, from `find_worst`.
     budget : Budget, optional
         When to stop; what is bounded by then still holds.
+    scheduled : ScheduledLaw, optional
+        The law, in place of the controller's, that changes over one of the coordinates.
 
     Returns
     -------
@@ -172,14 +189,16 @@ def bracket(
     peaks = np.zeros(2) if worst is None else np.array([worst.ms, worst.mt])
     try:
         controller = close_terms(controller, plant)
-        search = _start(controller, plant, unknown, budget.tolerance, peaks, 0.0 if worst is None else worst.severity)
+        search = _start(
+            controller, plant, unknown, budget.tolerance, peaks, 0.0 if worst is None else worst.severity, scheduled
+        )
         while search.arcs.box.size and search.count < budget.boxes and time.perf_counter() < end:
             if not np.all(np.isfinite(search.lower)) or (search.count and not search.within.size):
                 break  # a plant is unstable, or there is nothing to halve
             first, boxes = not search.count, search.boxes
             _step(search)
             if first and not np.all(np.isfinite(search.arcs.s)):
-                _check_digits(controller, plant, search.within, boxes)
+                _check_digits(search, boxes)
         search.stable &= bool(np.all(_measure(search, search.boxes.centre)))
     except ControlError as error:
         return Bracket(
@@ -223,16 +242,20 @@ def _start(
     tolerance: float,
     peaks: Float[np.ndarray, " 2"],
     severity: float,
+    scheduled: ScheduledLaw | None,
 ) -> _BranchAndBound:
     within = build_region(plant, replace(unknown, nominal=controller.delay(unknown.nominal)))
     boxes = within.cover(controller.sample_time_s)
     hardness = _measure_hardness(controller, plant, within, boxes)
+    law = expand_controller(controller) if scheduled is None else expand_nothing(controller)
     while boxes.centre.shape[0] < BOX_BLOCK and np.sum(hardness * boxes.radius[0]) > EASY:
         axis = int(np.argmax(hardness * boxes.radius[0]))
         boxes = within.cut(boxes.halve(np.full(boxes.centre.shape[0], axis)))[0]
     return _BranchAndBound(
         controller=controller,
         plant=plant,
+        scheduled=scheduled,
+        law=law,
         within=within,
         tolerance=tolerance,
         boxes=boxes,
@@ -257,13 +280,21 @@ def _make_arcs(count: int) -> Arcs:
     )
 
 
-def _check_digits(controller: Controller, plant: Plant, within: Region, boxes: Boxes) -> None:
+def _enclose(search: _BranchAndBound, boxes: Boxes) -> ImpulseTransfer:
+    """Return the sampled plant over boxes, with a law in front of it that changes over them."""
+    sampled, scheduled = enclose_plant(search.controller, search.plant, search.within, boxes), search.scheduled
+    if scheduled is None:
+        return sampled
+    values = search.within.enclose(boxes, sampled.denominator.basis.degree)
+    return scheduled.extend(sampled, values[scheduled.coordinate])
+
+
+def _check_digits(search: _BranchAndBound, boxes: Boxes) -> None:
     """Refuse a loop that loses so many digits that not even one plant can be bounded at single angles."""
-    point = Boxes(centre=boxes.centre[:1], radius=np.zeros_like(boxes.radius[:1]))
+    plant, point = search.plant, Boxes(centre=boxes.centre[:1], radius=np.zeros_like(boxes.radius[:1]))
     arcs = _make_arcs(1)
     arcs = replace(arcs, half=0.0 * arcs.half)
-    enclosed = enclose_plant(controller, plant, within, point)
-    if not np.all(np.isfinite(bound_arcs(controller, enclosed, point, within.ball, arcs).s)):
+    if not np.all(np.isfinite(bound_arcs(search.law, _enclose(search, point), point, search.within.ball, arcs).s)):
         raise ControlError(
             f"{plant.name} cannot be distinguished from a plant with a pole on the unit circle: its "
             f"{len(plant.states)} states lose too many digits, or the pole is there"
@@ -296,7 +327,7 @@ def _step(search: _BranchAndBound) -> None:
     boxes, arcs = take_rows(search.boxes, chosen), _take_arcs_of(search.arcs, chosen, worst.size)
     waiting = _take_arcs_of(search.arcs, others, worst.size)
     stable = _measure(search, boxes.centre)
-    sampled = enclose_plant(search.controller, search.plant, search.within, boxes)
+    sampled = _enclose(search, boxes)
     left, blame = _bound_block(search, sampled, boxes, arcs, stable)
     search.count += chosen.size
     search.boxes, search.arcs = take_rows(search.boxes, others), waiting
@@ -316,7 +347,7 @@ def _bound_block(
     first = True
     while arcs.box.size:
         block, arcs = take_rows(arcs, slice(0, ARC_BLOCK)), take_rows(arcs, slice(ARC_BLOCK, None))
-        new = bound_arcs(search.controller, sampled, boxes, search.within.ball, block)
+        new = bound_arcs(search.law, sampled, boxes, search.within.ball, block)
         block = block.tighten(new.s, new.t)
         if first:
             _measure(search, _worst_corners(search, boxes, block, new))
@@ -382,7 +413,7 @@ def _measure(search: _BranchAndBound, points: Points) -> Bool[np.ndarray, " c"]:
         return np.ones(0, dtype=bool)
     fixed = {name: np.full(len(points), value) for name, value in within.fixed.items()}
     values = within.evaluate(points) | fixed
-    figures = batch_figures(search.controller, search.plant, search.within.nominal, values)
+    figures = _measure_draws(search, values)
     inside = within.contains(points)
     for k, peaks in enumerate((figures.ms, figures.mt)):
         search.lower[k] = max(search.lower[k], np.max(peaks[inside], initial=0.0))
@@ -392,3 +423,19 @@ def _measure(search: _BranchAndBound, points: Points) -> Bool[np.ndarray, " c"]:
         search.severity = float(severity[worst])
         search.parameters = {name: float(column[worst]) for name, column in values.items()}
     return np.broadcast_to(figures.spectral_radius < STABLE, count)
+
+
+def _measure_draws(search: _BranchAndBound, values: dict[str, Float[np.ndarray, " n"]]) -> BatchFigures:
+    """Return the figures of draws, each with the law that it has where that changes over the one coordinate."""
+    scheduled, plant, nominal = search.scheduled, search.plant, search.within.nominal
+    if scheduled is None:
+        return batch_figures(search.controller, plant, nominal, values)
+    different, rows = np.unique(values[scheduled.coordinate], return_inverse=True)
+    first = [int(np.argmax(rows == k)) for k in range(different.size)]
+    figures = [
+        batch_figures(
+            scheduled.at(float(value)), plant, nominal, {name: column[k : k + 1] for name, column in values.items()}
+        )
+        for k, value in zip(first, different, strict=True)
+    ]
+    return take_rows(join_rows(figures), rows)

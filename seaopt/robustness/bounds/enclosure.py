@@ -130,6 +130,11 @@ def _sign(a: Taylor) -> Taylor:
     return make_constant(np.where(sure, np.sign(a.c), 0.0), a.basis).with_remainder(np.where(sure, 0.0, 1.0))
 
 
+def _compare(a: Entry, b: Entry) -> Entry:
+    """Return 1 where a is the smaller for certain, 0 where it is the larger, and between them elsewhere."""
+    return 0.5 * (1.0 + _sign(b - a))  # pyright: ignore[reportArgumentType]
+
+
 BINARY: dict[int, Callable[[Any, Any], Entry]] = {
     ca.OP_ADD: lambda a, b: a + b,
     ca.OP_SUB: lambda a, b: a - b,
@@ -137,6 +142,8 @@ BINARY: dict[int, Callable[[Any, Any], Entry]] = {
     ca.OP_DIV: lambda a, b: a * (b.reciprocal() if isinstance(b, Taylor) else 1.0 / b),
     ca.OP_POW: _raise_to_power,
     ca.OP_CONSTPOW: _raise_to_power,
+    ca.OP_LT: _compare,
+    ca.OP_LE: _compare,
     ca.OP_FMAX: _larger,
     ca.OP_FMIN: lambda a, b: -_larger(-a, -b),
 }

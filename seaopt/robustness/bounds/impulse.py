@@ -93,7 +93,7 @@ def _sample(
     heads, tails, denominator = list[Taylor](), list[Taylor](), None
     for c, d in read:
         drives = [newer, gamma - newer] if split else [newer, newer * 0.0]
-        denominator, (head, tail) = _expand_polynomials(f, c.transform(np.eye(1), right), drives)
+        denominator, (head, tail) = expand_polynomials(f, c.transform(np.eye(1), right), drives)
         through = denominator * d[:, 0]
         heads.append(head + mask_models(through, ~late_through))
         tails.append(tail + mask_models(through, late_through))
@@ -118,7 +118,7 @@ def _sum_series(x: Taylor, identity: Taylor) -> tuple[Taylor, Taylor]:
     return x, out
 
 
-def _expand_polynomials(f: Taylor, c: Taylor, drives: list[Taylor]) -> tuple[Taylor, list[Taylor]]:
+def expand_polynomials(f: Taylor, c: Taylor, drives: list[Taylor]) -> tuple[Taylor, list[Taylor]]:
     """Return det(wI - f) and c adj(wI - f) drive, coefficients ascending along the last axis."""
     count, n = f.c.shape[:2]
     identity = np.eye(n)

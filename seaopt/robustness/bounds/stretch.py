@@ -1,17 +1,9 @@
-r"""Ms of a scheduled law from above, on a whole stretch of its variable: the plant enclosed, the law's change added.
+r"""Ms of a scheduled law from above, on a whole stretch of its variable between two points of its table.
 
-On a stretch with the middle :math:`\bar s` the loop of the middle's law, :math:`\bar C`, is bounded by branch and bound
-for every plant of the stretch: it is stable there, with :math:`|S| \le M_S` and :math:`|T| \le M_T`
-(`seaopt.robustness.bounds.bracket`). The law itself changes by no more than :math:`|C_s/\bar C - 1| \le \epsilon` at
-any frequency (`GainTable.bound_change`), and
-
-.. math::
-    1 + P_s C_s = (1 + P_s \bar C)\Big(1 + T\,\frac{C_s - \bar C}{\bar C}\Big), \qquad
-    |S_s| \le \frac{M_S}{1 - \epsilon M_T} \quad \text{where } \epsilon M_T < 1 .
-
-On the way from :math:`\bar C` to :math:`C_s` nothing crosses -1, and the poles of the law on or outside the unit circle
-stay, so that every frozen loop of the stretch is stable. :math:`\epsilon` is the largest of a curve without resonances
-on `ANGLES` frequencies, with a thousandth added.
+Where the plant has the variable, law and plant change together over one coordinate; where it has not, the law alone
+does. Both are enclosed over boxes of it (`seaopt.robustness.bounds.scheduled_law`), and branch and bound shows that
+every frozen loop of the stretch is stable, and what no Ms exceeds (`seaopt.robustness.bounds.bracket`): with all parts
+of the law, its outer loop, and what its terms feed back.
 """
 
 from __future__ import annotations
@@ -22,16 +14,16 @@ import numpy as np
 
 from seaopt.codec import OrInfinite
 from seaopt.control import Controller, GainTable
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
+from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Budget, bracket
+from seaopt.robustness.bounds.scheduled_law import ScheduledLaw
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
 
-ANGLES = 4000
-LOWEST = 1e-9  # of the sample rate: from here
-ROUNDING = 1.001
 BUDGET = Budget(tolerance=0.02, boxes=400, seconds=20.0)
+PLACE = "schedule_place"  # a parameter, of a plant without the variable
 
 
 @record
@@ -46,8 +38,6 @@ class StretchBound:
         Ends of the stretch.
     ms : float
         No Ms is larger; infinite where nothing is shown.
-    change : float
-        By which share of itself the law differs from that of the middle, at most.
     reason : str
         Why nothing is shown; empty where it is.
     """
@@ -56,7 +46,6 @@ class StretchBound:
     low: float
     high: float
     ms: OrInfinite
-    change: OrInfinite
     reason: str
 
     @property
@@ -65,28 +54,26 @@ class StretchBound:
         return not self.reason
 
 
+@memo
+def place_plant(plant: Plant, over: str, unit: str) -> Plant:
+    """Return a plant that has a schedule's variable, or a parameter in its place that nothing depends on."""
+    if {over, PLACE} & {*plant.parameters, *plant.states}:
+        return plant
+    return replace(plant, parameters={**plant.parameters, PLACE: Parameter(name=PLACE, value=0.0, unit=unit)})
+
+
 def bound_stretch(
     name: str, middle: Controller, table: GainTable, plant: Plant, params: ParameterSet, low: float, high: float
 ) -> StretchBound:
-    """Bound Ms of a schedule on a stretch between points, `middle` at its middle, on a plant without friction."""
-    terms = middle.compensation
-    if terms is not None and any(name in plant.outputs for name in terms.reads):
-        reason = "what a compensation feeds back of gravity, ripple or speed is not bounded"
-        return StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=reason)
-    frequencies = np.geomspace(LOWEST, 0.5, ANGLES) / table.sample_time_s
-    change = ROUNDING * float(np.max(table.bound_change(low, high, frequencies)))
-    if np.isinf(change):
-        reason = "how far a law with other parts than a pid and a prefilter changes between two values is not bounded"
-        return StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=reason)
-    moves = table.over in plant.parameters or table.over in plant.states
-    ranges = {table.over: (low, high)} if moves else {}  # of a plant without the variable the law alone changes
+    """Bound Ms of a schedule on a stretch between points, `middle` at its middle with terms and outer loop, on a plant
+    of `split_states`.
+    """
     values = ParameterSet(replace(each, std=None) for each in params.values())  # of a fit its values alone count here
-    unknown = combine_uncertainty(values, ParameterSet(), ranges, {name: plant})
-    bounded = bracket(middle, plant, replace(unknown, names=(), covariance=np.zeros((0, 0))), budget=BUDGET)
-    reason = ""
-    if not bounded.bounded_stable:
-        reason = bounded.left_out or f"no bound in {bounded.boxes} boxes"
-    elif not change * bounded.mt_upper < 1.0:
-        reason = f"the law changes by {100 * change:.3g} % on the stretch, with Mt up to {bounded.mt_upper:.3g}"
-    ms = np.inf if reason else bounded.ms_upper / (1.0 - change * bounded.mt_upper)
-    return StretchBound(plant=name, low=low, high=high, ms=float(ms), change=change, reason=reason)
+    plant = place_plant(plant, table.over, table.unit)
+    place = PLACE if PLACE in plant.parameters else table.over
+    law = ScheduledLaw.of(table, low, high, middle, plant, place)
+    unknown = combine_uncertainty(values, ParameterSet(), {place: (low, high)}, {name: plant})
+    unknown = replace(unknown, names=(), covariance=np.zeros((0, 0)))
+    bounded = bracket(middle, plant, unknown, budget=BUDGET, scheduled=law)
+    reason = "" if bounded.bounded_stable else bounded.left_out or f"no bound in {bounded.boxes} boxes"
+    return StretchBound(plant=name, low=low, high=high, ms=np.inf if reason else bounded.ms_upper, reason=reason)

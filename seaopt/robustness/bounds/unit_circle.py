@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from seaopt.control import Controller, Law
+from seaopt.control import Controller
 from seaopt.records import record
 from seaopt.robustness.bounds.impulse import ImpulseTransfer
 from seaopt.robustness.bounds.region import Boxes
@@ -30,6 +30,18 @@ Slopes = Float[np.ndarray, "p k"]
 BallCoordinates = Float[np.ndarray, "p b"]
 Powers = Complex[np.ndarray, "p j 5"]  # value, first and second order, bounds on the remainder and on all
 Coefficients = Float[np.ndarray, " m"]  # of a polynomial, ascending
+
+
+@record(eq=False)
+class LawPolynomials:
+    """Numerators of every C_y and their denominator, in ascending powers of 1 - 1/z. In these, as in w, nothing cancels
+    near z = 1, where the law's slow poles and its integrators lie.
+    """
+
+    numerators: tuple[Coefficients, ...]
+    denominator: Coefficients
+    through: tuple[float, ...]  # what every C_y has at infinity
+    delay_samples: int  # until the command is put out
 
 
 @record(eq=False)
@@ -94,14 +106,14 @@ class ArcModel:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # where D may be zero, which `_divide` handles
-def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, ball: int, arcs: Arcs) -> ArcBounds:
+def bound_arcs(law: LawPolynomials, plant: ImpulseTransfer, boxes: Boxes, ball: int, arcs: Arcs) -> ArcBounds:
     """Return bounds on the arcs; `ball` coordinates of a box count only where they are in the unit ball."""
-    (nums, den), box = _expand_law(controller.law), arcs.box
-    below = _expand_powers(den, np.zeros(box.size, dtype=int), arcs, plant.denominator.c.shape[1])
-    delay = controller.compute_delay_samples + plant.whole[box]
+    box = arcs.box
+    below = _expand_powers(law.denominator, np.zeros(box.size, dtype=int), arcs, plant.denominator.c.shape[1])
+    delay = law.delay_samples + plant.whole[box]
     open_loop = (_pack(plant.denominator, box), below)
     parts = [open_loop]
-    for num, head, tail in zip(nums, plant.heads, plant.tails, strict=True):
+    for num, head, tail in zip(law.numerators, plant.heads, plant.tails, strict=True):
         parts.append((_pack(head, box), _expand_powers(num, delay, arcs, below.shape[1])))
         parts.append((_pack(tail, box), _expand_powers(num, delay + 1, arcs, below.shape[1])))
     n, d = _sum_models([open_loop]), _sum_models(parts)
@@ -109,7 +121,7 @@ def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, bal
     t = ArcModel(c=1.0 - s.c, g=-s.g, h=-s.h, r=s.r)
     at, width = boxes.centre[box], boxes.radius[box]
     (top_s, slope_s), (top_t, slope_t) = (_bound_magnitude(model, at[:, :ball], width[:, :ball]) for model in (s, t))
-    proper = _keeps_degree(controller, plant)[box]
+    proper = _keeps_degree(law, plant)[box]
     top_s, top_t = np.where(proper, top_s, np.inf), np.where(proper, top_t, np.inf)
     size = np.maximum(np.abs(d.c), 1e-300)
     by_box = np.abs(d.g[:, :-1]) + np.sum(np.abs(d.h[:, :-1]), axis=2)
@@ -123,12 +135,12 @@ def bound_arcs(controller: Controller, plant: ImpulseTransfer, boxes: Boxes, bal
     )
 
 
-def _keeps_degree(controller: Controller, plant: ImpulseTransfer) -> Bool[np.ndarray, " b"]:
+def _keeps_degree(law: LawPolynomials, plant: ImpulseTransfer) -> Bool[np.ndarray, " b"]:
     """Tell which boxes' D keeps its degree: 1 + d d_c is not zero without delay, and no pole comes from infinity."""
-    last = plant.heads[0][:, -1] * -float(controller.law.d[1])
-    for head, d_c in zip(plant.heads[1:], controller.law.d[2:], strict=True):
-        last = last + head[:, -1] * -float(d_c)
-    return (controller.compute_delay_samples + plant.whole > 0) | (np.abs(1.0 + last.c) > last.reach)
+    last = plant.heads[0][:, -1] * law.through[0]
+    for head, through in zip(plant.heads[1:], law.through[1:], strict=True):
+        last = last + head[:, -1] * through
+    return (law.delay_samples + plant.whole > 0) | (np.abs(1.0 + last.c) > last.reach)
 
 
 def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
@@ -141,10 +153,9 @@ def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
     return np.moveaxis(np.concatenate([model.a[: 1 + k], h]), 0, 1)[box], remainder[box]
 
 
-def _expand_law(law: Law) -> tuple[list[Coefficients], Coefficients]:
-    """Return the numerator of every C_y, and their denominator, in ascending powers of 1 - 1/z. In these, as in w,
-    nothing cancels near z = 1, where the law's slow poles and its integrators lie.
-    """
+def expand_controller(controller: Controller) -> LawPolynomials:
+    """Return the polynomials of a controller's law."""
+    law = controller.law
     m, (a, b, c) = law.integrators, law.rest
     delta, q = np.array([0.0, 1.0]), np.array([1.0, -1.0])
 
@@ -164,7 +175,23 @@ def _expand_law(law: Law) -> tuple[list[Coefficients], Coefficients]:
         for j, gain in enumerate(law.b[:m, column], start=1):
             num = num + gain * multiply(*[q] * j, *[delta] * (m - j), slow)
         nums.append(-num)
-    return nums, multiply(*[delta] * m, slow)
+    return LawPolynomials(
+        numerators=tuple(nums),
+        denominator=multiply(*[delta] * m, slow),
+        through=tuple((-law.d[1:]).tolist()),
+        delay_samples=controller.compute_delay_samples,
+    )
+
+
+def expand_nothing(controller: Controller) -> LawPolynomials:
+    """Return the polynomials beside a plant that has the law of a controller in front of it."""
+    one, signals = np.ones(1), len(controller.signals)
+    return LawPolynomials(
+        numerators=(one,) * signals,
+        denominator=one,
+        through=(1.0,) * signals,
+        delay_samples=controller.compute_delay_samples,
+    )
 
 
 def _expand_powers(law: Coefficients, delay: Int[np.ndarray, " p"], arcs: Arcs, count: int) -> Powers:

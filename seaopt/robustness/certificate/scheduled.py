@@ -25,14 +25,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seaopt.control import ScheduledController
-from seaopt.control.running.fed_back import feeds_back, split_states
+from seaopt.control.running.fed_back import LaterTerms, feeds_back, split_states
 from seaopt.control.scheduling.scheduled_controller import place_variable
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import join_words
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, count_off
-from seaopt.robustness.bounds.stretch import StretchBound, bound_stretch
+from seaopt.robustness.bounds.stretch import PLACE, StretchBound, bound_stretch, place_plant
 from seaopt.robustness.certificate.cases import Check, Evidence, Survey
 from seaopt.robustness.certificate.measured_draws import draw_requirements, name_worst
 from seaopt.robustness.certificate.requirement import Requirement, Spot, require_at_least, require_at_most
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from seaopt.robustness.certificate.certificate import Certificate
 
 MOTION_RATE = "min_motion_rate"
-FED_BACK = "what its terms, or its outer loop, feed back is in no bound"
+TERMS_CHANGE = "what is compensated changes with a state of the plant on the stretch"
 BOUND, SWEEP = 0.2, 5.0  # seconds that a stretch, and the sweeps of a plant, take as a rule
 
 
@@ -118,14 +118,20 @@ def _bound_plants(
 ) -> list[StretchBound]:
     """Return what is proved of every plant on the stretch between two neighbouring values."""
     (schedule, models), (low, high) = shared.value, stretch
-    middle = replace(schedule.controllers[0], law=schedule.table.law(0.5 * (low + high)))
+    law, first, last = schedule.table.law(0.5 * (low + high)), schedule.terms_at(low), schedule.terms_at(high)
+    middle = replace(schedule.controllers[0], law=law, compensation=first)
     out: list[StretchBound] = []
-    for name, plant in split_states(middle, models, nominal).items():
-        if feeds_back(middle, plant):
-            out.append(StretchBound(plant=name, low=low, high=high, ms=np.inf, change=np.inf, reason=FED_BACK))
-            continue
-        values = place_variable(plant, nominal, schedule.over, 0.5 * (low + high))
-        out.append(bound_stretch(name, middle, schedule.table, plant, values, low, high))
+    for name, model in models.items():
+        plant, later = place_plant(model, schedule.over, schedule.unit), None
+        place = schedule.over if schedule.over in {*plant.parameters, *plant.states} else PLACE
+        if last is not None and last != first:
+            later = LaterTerms(terms=last, over=place, low=low, high=high)
+        values = place_variable(plant, nominal, place, 0.5 * (low + high))
+        for label, variant in split_states(middle, {name: plant}, values, later=later).items():
+            if later is not None and place in plant.states and feeds_back(replace(middle, outer=None), variant):
+                out.append(StretchBound(plant=label, low=low, high=high, ms=np.inf, reason=TERMS_CHANGE))
+                continue
+            out.append(bound_stretch(label, middle, schedule.table, variant, values, low, high))
     return out
 
 

@@ -152,13 +152,6 @@ def test_half_a_notch_and_gains_of_a_cascade_without_its_signal_are_refused():
         make_table(INNER, None)
 
 
-@pytest.mark.parametrize("name", LAWS)
-def test_the_change_of_a_law_without_a_rule_for_it_is_not_bounded(name):
-    gains, speed = LAWS[name]
-    change = make_table(gains, speed).bound_change(0.0, 0.7, np.array([1.0, 10.0]))
-    assert np.all(np.isinf(change)) == (speed is not None or "notch_width" in gains)
-
-
 PARTS = ["notch and prefilter", "cascade", "observer", "observer and notch", "link", "link and observer"]
 
 
