@@ -44,6 +44,7 @@ def find_cause(log):
     return cause
 
 
+@pytest.mark.slow  # every hypothesis of a held joint is tried ahead of it
 def test_the_spring_is_damped_and_no_channel_is_late():
     cause = find_cause(record(damper=DAMPER))
     assert cause.text.startswith("likely cause: c_s") and "early" not in cause.text
