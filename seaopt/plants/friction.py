@@ -4,7 +4,7 @@ Dry friction smoothed through zero, f_c tanh(v/v_s), looks at rest like a damper
 the joint moves; Stribeck's falling part is then even a negative one. A loop is therefore looked at on two plants that
 are linear in that velocity: with every friction replaced by viscous friction of its steepest and of its flattest slope.
 They have the names, roles and parameters of the plant they stand for, so that all that works on a plant works on them.
-No motion keeps to the speed at which a curve falls the steepest: a third plant has the slopes of fast sliding.
+No motion keeps to the speed at which a curve falls the steepest: a third plant is flat there, as where it slides fast.
 
 A friction with bristles (LuGre's, a spring's hysteresis) is a spring where it sticks, of the stiffness sigma_0 beside
 the damping sigma_1. It may stick while others slide, as a spring does behind a motor that moves: each is looked at in
@@ -50,7 +50,7 @@ STATES = (SLIDING, STUCK)
 SAMPLED_SPEEDS = np.concatenate([[0.0], np.geomspace(1e-7, 1e3, 201)])
 SMOOTHED = 10.0  # times the speed of its smoothing a curve is what it smooths
 LOW_SPEED = 1.0  # m/s or rad/s: up to here a curve shows its dry friction
-FLAT = 1e-6  # of the span of a curve's slopes, that is rounding
+FLAT = 1e-6  # of a curve's steepest slope, that is rounding
 LEAST_SIZE = 1e-15  # N or N m: of a wave
 FORGETTING = 1.0  # rad/s: by which bristles of a linear plant go back; nothing depends on them there
 
@@ -66,13 +66,6 @@ def bound_slopes(friction: Friction, p: Any) -> tuple[Any, Any]:
     slope = ca.jacobian(ca.SX(friction.force(v, p)), v)
     sampled = [ca.substitute(slope, v, float(sign * speed)) for speed in SAMPLED_SPEEDS for sign in (1.0, -1.0)]
     return ca.mmin(ca.vertcat(*sampled)), ca.mmax(ca.vertcat(*sampled))
-
-
-def _find_fast_slope(friction: Friction, p: Any) -> Any:
-    """Return the slope of a friction curve at parameters p where it slides fast: the flatter one of both directions."""
-    v, p = ca.SX.sym("v"), friction.add_rated(p)
-    slope = ca.jacobian(ca.SX(friction.force(v, p)), v)
-    return ca.fmin(*(ca.substitute(slope, v, float(sign * SAMPLED_SPEEDS[-1])) for sign in (1.0, -1.0)))
 
 
 def friction_slopes(plant: Plant, params: ParameterSet) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
@@ -214,16 +207,19 @@ def take_sliding(plant: Plant, params: ParameterSet) -> Plant:
 
 @memo
 def slide_fast(plant: Plant) -> Plant:
-    """Return the sliding plant with each friction's slope at high speed, where no curve falls any more."""
+    """Return the sliding plant where no friction falls with the speed any more: flat in place of a falling slope."""
     return _with_slopes(plant, FAST, ())
 
 
 def falls(plant: Plant, params: ParameterSet) -> bool:
-    """Tell whether a friction falls with the speed somewhere, as Stribeck's does, below its slope at high speed."""
-    p = plant.complete(params).by_attribute
-    flattest, steepest = friction_slopes(plant, params)
-    fast = np.array([float(ca.DM(_find_fast_slope(each, p))) for each in plant.friction.values()])
-    return bool(np.any(fast - flattest > FLAT * np.maximum(steepest - flattest, 1e-300)))
+    """Tell whether a friction falls with the speed somewhere, and no more at high speed, as Stribeck's does."""
+    p, v = plant.complete(params).by_attribute, ca.SX.sym("v")
+    for friction in plant.friction.values():
+        slope = ca.Function("slope", [v], [ca.jacobian(ca.SX(friction.force(v, friction.add_rated(p))), v)])
+        slopes = np.array(slope(np.outer([-1.0, 1.0], SAMPLED_SPEEDS).reshape(1, -1))).reshape(2, -1)
+        if np.min(slopes) < -FLAT * np.max(np.abs(slopes)) <= np.min(slopes[:, -1]):
+            return True
+    return False
 
 
 def can_stick(plant: Plant) -> bool:
@@ -352,7 +348,8 @@ def _with_slopes(plant: Plant, state: str, sticking: Collection[str]) -> Plant:
 
     def choose_slope(name: str, friction: Friction, p: Any) -> Any:
         if name not in sticking:
-            return _find_fast_slope(friction, p) if state == FAST else bound_slopes(friction, p)[0]
+            flattest = bound_slopes(friction, p)[0]
+            return ca.fmax(flattest, 0.0) if state == FAST else flattest
         return bristled[name].damping(p) if name in bristled else bound_slopes(friction, p)[1]
 
     def hold(x: Any, u: Any, p: Any) -> Any:

@@ -230,9 +230,10 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     """Return a ball screw's actuator."""
     lines = _Lines(interview, facts, thor(), "N/m")
     forces, moves = facts.outputs & {"F1", "F2"}, "swing" in facts.places
-    why = "a typical value; take it from the data sheet"
+    also = ", and correct the scale of q with it" if "screw" in facts.outputs else ""
+    why = f"a typical value; take it from the data sheet{also}"
     lines.known("l", "Travel l for one turn (lead of the screw, or circumference of the belt's pulley)", why=why)
-    lines.known("N_p", "Reduction N_p between motor and screw", 1.0, "driven directly")
+    lines.known("N_p", "Reduction N_p between motor and screw", 1.0, f"driven directly{also}")
     _add_drive(lines, facts, effort=bool(forces))
     lines.free("J", 1e-5)
     lines.free("b_r")

@@ -195,9 +195,9 @@ def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, intervie
     guesses.append(_mark_role(column.name, log.roles.doubts.get(column.name, ""), interview))
     if role == "screw":  # the nut goes r for a radian
         scale, unit = scale * screw_travel(actuator.lines) * factor(unit, "rad"), "m"
-        notes.append("as the place of the nut, by the lead of the screw")
+        notes.append("as the place of the nut, l/(2 pi N_p) for a radian: the scale changes with l and N_p")
     if role == "torque":
-        notes.append("as a current, by K_tau")
+        notes.append("as a current, by K_tau, which the scale changes with")
     if role == "theta_m" and log.plant != "held" and reads_output(log):
         scale *= next(float(line.value) for line in actuator.lines if line.name == "N")
         interview.assume(f"gear:{column.name}")

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.errors import FileError
 from seaopt.files import to_json
+from seaopt.plants.friction import falls
 from tests.laws import measurement_matrices
 from tests.stick_slip import Mass, simulate
 
@@ -142,6 +143,15 @@ def test_a_file_states_the_range_that_its_law_has(plant, tuned):
         so.Controller.from_dict(content, plant, params)
     del content["achieved"]["bandwidth_sliding_fast_hz"]  # as older files are
     so.Controller.from_dict(content, plant, params)
+
+
+def test_damping_that_differs_by_direction_does_not_fall():
+    """Its slope is negative in one direction, at all speeds alike."""
+    uneven = so.plants.rotary(link="locked", parts=("friction_direction",))
+    params = uneven.defaults.update(f_c=0.01, b_a=1e-5)
+    assert not falls(uneven, params)
+    steep = so.plants.rotary(link="locked", parts=("stribeck",))
+    assert falls(steep, steep.defaults.update(f_c=0.01, f_s=0.02, v_st=1.0))
 
 
 def test_friction_that_does_not_fall_makes_no_range(plant, tuned):

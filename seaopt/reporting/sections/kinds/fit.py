@@ -260,7 +260,7 @@ def _list_cures(fit: Fit, plants: Sequence[str]) -> Iterator[str]:
         places.setdefault(place, {}).update({} if line == place else {line: None})
     for place, rows in places.items():
         for header in [place.replace(NAME, name) for name in plants] if NAME in place else [place]:
-            yield "\n".join([f"write under {header}, in place of a line of the same name:", *rows])
+            yield "\n".join([f"write under {header}, in place of a line of that name if there is one:", *rows])
 
 
 def spell_cure(name: str, value: float) -> list[str]:
