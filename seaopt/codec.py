@@ -128,15 +128,15 @@ def check_agrees(content: Any, own: Any, source: str, *, remedy: str, place: str
         raise FileError(f"{source}: {place} is {found}, and the other keys make {made}; {remedy}")
 
 
-def _agree(one: Any, other: Any, rtol: float) -> bool:
-    if isinstance(one, list) and isinstance(other, list):
-        pairs = list(zip(cast(list[Any], one), cast(list[Any], other), strict=False))
-        return len(one) == len(other) and all(_agree(a, b, rtol) for a, b in pairs)
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(_agree(one[key], other[key], rtol) for key in one)
-    if isinstance(one, float | int) and isinstance(other, float | int) and bool not in (type(one), type(other)):
-        return math.isclose(one, other, rel_tol=rtol)
-    return type(cast(Any, one)) is type(cast(Any, other)) and one == other
+def _agree(a: Any, b: Any, rtol: float) -> bool:
+    if isinstance(a, list) and isinstance(b, list):
+        pairs = list(zip(cast(list[Any], a), cast(list[Any], b), strict=False))
+        return len(a) == len(b) and all(_agree(*pair, rtol) for pair in pairs)
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(_agree(a[key], b[key], rtol) for key in a)
+    if isinstance(a, float | int) and isinstance(b, float | int) and bool not in (type(a), type(b)):
+        return math.isclose(a, b, rel_tol=rtol)
+    return type(cast(Any, a)) is type(cast(Any, b)) and a == b
 
 
 def list_keys(cls: type[Any]) -> Iterator[Key]:

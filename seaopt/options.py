@@ -79,13 +79,13 @@ def list_options(record: type[Any]) -> tuple[OptionField, ...]:
     kinds = get_type_hints(record)
     return tuple(
         OptionField(
-            name=one.name,
-            kind=kinds[one.name],
-            option=one.metadata["option"],
-            default=one.default if one.default_factory is MISSING else one.default_factory(),
+            name=entry.name,
+            kind=kinds[entry.name],
+            option=entry.metadata["option"],
+            default=entry.default if entry.default_factory is MISSING else entry.default_factory(),
         )
-        for one in fields(record)
-        if "option" in one.metadata
+        for entry in fields(record)
+        if "option" in entry.metadata
     )
 
 
@@ -100,34 +100,34 @@ def check_options(record: Any, error: type[SeaoptError], prefix: str = "") -> No
     """Refuse numbers and words of a record that its options do not take; `prefix` stands before names in messages. What
     is neither (lists, tables, numbers that may be lifted by False) is left to the record.
     """
-    for one in list_options(type(record)):
-        value = getattr(record, one.name)
-        kinds = split_union(one.kind)
+    for entry in list_options(type(record)):
+        value = getattr(record, entry.name)
+        kinds = split_union(entry.kind)
         if value is None and NoneType in kinds:
             continue
         kinds = tuple(kind for kind in kinds if kind is not NoneType)
-        name = f"{prefix}{one.option.key or one.name}"
+        name = f"{prefix}{entry.option.key or entry.name}"
         if all(get_origin(kind) is Literal for kind in kinds):
             choices = [choice for kind in kinds for choice in get_args(kind)]
             if value not in choices:
                 raise error(f"{name} = {_quote(value)} is not known; {suggestion(str(value), choices)}")
         elif kinds in ((float,), (int,)):
-            _check_number(name, value, one, kinds[0], error)
+            _check_number(name, value, entry, kinds[0], error)
 
 
 def _quote(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else repr(value)
 
 
-def _check_number(name: str, value: Any, one: OptionField, kind: type, error: type[SeaoptError]) -> None:
+def _check_number(name: str, value: Any, entry: OptionField, kind: type, error: type[SeaoptError]) -> None:
     numeric = Real if kind is float else Integral  # NumPy's numbers are, too
     if isinstance(value, bool) or not isinstance(value, numeric) or not math.isfinite(value):
-        unit = f" in {one.option.unit}" if one.option.unit else ""
+        unit = f" in {entry.option.unit}" if entry.option.unit else ""
         raise error(f"{name} = {value!r} is not a {'finite' if kind is float else 'whole'} number; give one{unit}")
-    if not one.option.holds(float(value)):
-        usual = isinstance(one.default, int | float) and not isinstance(one.default, bool)
-        remedy = f"give {name.rpartition('.')[2]} = {one.default:g}" if usual else "correct it, or leave it out"
-        raise error(f"{name} = {value:g} is not {one.option.describe_range()}; {remedy}")
+    if not entry.option.holds(float(value)):
+        usual = isinstance(entry.default, int | float) and not isinstance(entry.default, bool)
+        remedy = f"give {name.rpartition('.')[2]} = {entry.default:g}" if usual else "correct it, or leave it out"
+        raise error(f"{name} = {value:g} is not {entry.option.describe_range()}; {remedy}")
 
 
 def describe_kind(kind: Any) -> str:
@@ -152,15 +152,15 @@ def _name_kind(kind: Any) -> str:
 def document_options(record: type[Any]) -> str:
     """Return a record's docstring with its options as parameters, before its other sections."""
     lines = ["Parameters", "----------"]
-    for one in list_options(record):
-        kind = [describe_kind(one.kind), one.option.unit, one.option.describe_range()]
-        if one.default is None:
+    for entry in list_options(record):
+        kind = [describe_kind(entry.kind), entry.option.unit, entry.option.describe_range()]
+        if entry.default is None:
             kind.append("optional")
-        elif isinstance(one.default, str | int | float):
-            kind.append(f"default {_quote(one.default)}")
-        text = re.sub(r"\|([^|]+)\|", r"abs(\1)", one.option.text)  # bars are links to Sphinx
+        elif isinstance(entry.default, str | int | float):
+            kind.append(f"default {_quote(entry.default)}")
+        text = re.sub(r"\|([^|]+)\|", r"abs(\1)", entry.option.text)  # bars are links to Sphinx
         text = re.sub(r"^[a-z](?=[a-z]+ )", lambda first: first[0].upper(), text)
-        lines.append(f"{one.name} : {', '.join(part for part in kind if part)}")
+        lines.append(f"{entry.name} : {', '.join(part for part in kind if part)}")
         lines += textwrap.wrap(text, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
     head, *others = re.split(r"(?m)^(?=\s*(?:Raises|Examples|Notes)\n\s*-{3})", record.__doc__ or "", maxsplit=1)
     others = [INDENT + text.lstrip() for text in others] or [INDENT]

@@ -120,8 +120,8 @@ def is_unit(text: str) -> bool:
 def same_dimension(first: str, second: str) -> bool:
     """Return whether two unit texts have the same dimension (angles count as pure numbers, as in SI)."""
     if first.strip() in _USUAL and second.strip() in _USUAL:
-        one, other = _USUAL[first.strip()][0], _USUAL[second.strip()][0]
-        return _PURE.get(one, one) == _PURE.get(other, other)
+        pure = [_PURE.get(unit, unit) for unit in (_USUAL[first.strip()][0], _USUAL[second.strip()][0])]
+        return pure[0] == pure[1]
     return bool(_parse(first).dimensionality == _parse(second).dimensionality)
 
 

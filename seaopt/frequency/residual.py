@@ -41,7 +41,7 @@ NEAR, ALIKE = 9, 1.83  # lines that the power of the noise is averaged over, and
 
 @record(eq=False)
 class ResidualResponse:
-    """Of windows of one length, at each line: the response of the model's outputs, and of what they leave."""
+    """The response of the model's outputs and of what they leave, at each line of windows of one length."""
 
     frequency_hz: Lines
     model: Complex[np.ndarray, "y m"]  # H1 of the simulated outputs, by the same windows

@@ -72,7 +72,7 @@ def add_outer_loop(
             critical_impedance(law, plant, at, outer.stiffness, velocity_filter_s=filter_s)
             for law, at in (*laws, *between)
         ]
-        impedance = max(each, key=lambda one: one.damping)
+        impedance = max(each, key=lambda impedance: impedance.damping)
     else:
         impedance = Impedance(stiffness=outer.stiffness, damping=outer.damping, velocity_filter_s=filter_s)
     return [add_impedance(law, plant, at, impedance, name=outer.plant) for law, at in laws]

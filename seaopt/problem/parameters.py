@@ -30,14 +30,13 @@ def make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Paramet
                     f'experiment {experiment.name}: parameters names "{name}"; {suggestion(name, known)}'
                 )
     # What each log states for itself need not be stated for all.
-    own = {key: [set(e.parameters) for e in table.experiment if e.plant == key] for key in plants}
+    of_logs = {key: _list_stated(table, key) for key in plants}
     declared = {name: default for plant in plants.values() for name, default in plant.defaults.items()}
     turns = any(plant.actuation is not None and plant.actuation.unit == ROTARY.unit for plant in plants.values())
     built_in = known_parameters(rotary_first=turns)
     for key, plant in plants.items():
         undeclared = [name for name in plant.parameters if name not in declared]
-        stated = [name for name in undeclared if own[key] and all(name in given for given in own[key])]
-        missing = [name for name in undeclared if name not in tables and name not in stated]
+        missing = [name for name in undeclared if name not in tables and name not in of_logs[key]]
         if missing:
             raise ProblemError(_ask_for(key, plant, missing, built_in))
         declared |= {
@@ -46,9 +45,7 @@ def make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Paramet
             if name in tables
         }
     _check_units(plants)
-    _check_defaults(
-        plants, {key: set(tables).union(set[str].intersection(*given) if given else ()) for key, given in own.items()}
-    )
+    _check_defaults(plants, {key: stated.union(tables) for key, stated in of_logs.items()})
     # A plant of the file may use a built-in plant's name for something else.
     known = built_in | declared
     parameters = {name: known[name] for name in known if name in declared or name in tables}
@@ -70,10 +67,14 @@ def name_guesses(table: ProblemTable, plants: Mapping[str, Plant]) -> ProblemTab
     """Return the file with what it leaves out of a motor's heat among its guesses: no default is right for a motor."""
     names = list(table.guessed)
     for key, plant in plants.items():
-        own = [set(experiment.parameters) for experiment in table.experiment if experiment.plant == key]
-        stated = set(table.parameters).union(set[str].intersection(*own) if own else ())
-        names += list_guessed_heat(plant, stated)
+        names += list_guessed_heat(plant, _list_stated(table, key).union(table.parameters))
     return table.model_copy(update={"guessed": list(dict.fromkeys(names))})
+
+
+def _list_stated(table: ProblemTable, key: str) -> set[str]:
+    """Return the parameters that every experiment of a plant states for itself."""
+    stated = [set(experiment.parameters) for experiment in table.experiment if experiment.plant == key]
+    return set[str].intersection(*stated) if stated else set()
 
 
 def _ask_for(key: str, plant: Plant, missing: Sequence[str], known: Mapping[str, Parameter]) -> str:
@@ -97,12 +98,12 @@ def _check_units(plants: Mapping[str, Plant]) -> None:
     for key, plant in plants.items():
         for name in plant.parameters:
             unit = plant.parameter_unit(name)
-            other, known = first.setdefault(name, (key, unit))
+            first_plant, first_unit = first.setdefault(name, (key, unit))
             try:
-                factor(unit, known)
+                factor(unit, first_unit)
             except UnitError as error:
                 raise ProblemError(
-                    f"parameters.{name} is in {known} for plant.{other} and in {unit} for plant.{key}; "
+                    f"parameters.{name} is in {first_unit} for plant.{first_plant} and in {unit} for plant.{key}; "
                     "give each a problem file of its own"
                 ) from error
 
@@ -114,12 +115,13 @@ def _check_defaults(plants: Mapping[str, Plant], stated: Mapping[str, Collection
         for name, default in plant.defaults.items():
             if name in stated[key]:
                 continue
-            other, known = first.setdefault(name, (key, default))
-            value = default.value * factor(default.unit, known.unit)
-            if not math.isclose(value, known.value, rel_tol=1e-12):
+            first_plant, before = first.setdefault(name, (key, default))
+            value = default.value * factor(default.unit, before.unit)
+            if not math.isclose(value, before.value, rel_tol=1e-12):
                 raise ProblemError(
-                    f"parameters.{name} is missing: its default is {known.value:g} {known.unit} for plant.{other} and "
-                    f"{value:g} {known.unit} for plant.{key}; give {name} = ... in [parameters]"
+                    f"parameters.{name} is missing: its default is {before.value:g} {before.unit} for "
+                    f"plant.{first_plant} and {value:g} {before.unit} for plant.{key}; give {name} = ... in "
+                    "[parameters]"
                 )
 
 

@@ -82,7 +82,7 @@ class RippleFit:
 
     @property
     def amplitudes(self) -> tuple[float, ...]:
-        """Of each harmonic, in the command's unit."""
+        """The amplitude of each harmonic, in the command's unit."""
         return tuple(map(math.hypot, self.cos, self.sin))
 
     def compensation(self, fraction: float = RIPPLE_FRACTION) -> CompensateRipple:

@@ -217,7 +217,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
 
     @property
     def achieved(self) -> LoopFigures:
-        """Of the design plant while no limit is active, sliding where it has friction."""
+        """The design plant's figures while no limit is active, sliding where it has friction."""
         return self.measured_loops[0].figures
 
     @property

@@ -49,7 +49,7 @@ class Solved:
 
     @property
     def misfit(self) -> float:
-        """Of its evaluation: see `measure_misfit`."""
+        """The misfit of its evaluation: see `measure_misfit`."""
         return measure_misfit(self.solution.evaluation)
 
     @property

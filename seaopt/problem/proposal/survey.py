@@ -280,8 +280,9 @@ def _move_to_clock(
 
 
 def _describe_length(values: VectorN, usual: int) -> str:
-    one = values.size == 1
-    return f"one number beside the log, {values[0]:.6g}" if one else f"{values.size} samples, where the log has {usual}"
+    if values.size == 1:
+        return f"one number beside the log, {values[0]:.6g}"
+    return f"{values.size} samples, where the log has {usual}"
 
 
 def _find_copies(columns: Sequence[SurveyedColumn]) -> dict[str, str]:
