@@ -12,6 +12,8 @@ from seaopt.problem.schema import MPC, ControllerTable, MPCTable, ProblemTable
 PLANNED = {field.name: field.kind for field in list_options(MPCSpec)}
 SHARED = PLANNED.keys() & ControllerTable.model_fields.keys() - {"measured"}  # keys of [controller] that a plan has too
 
+ADDED = ("compensate", "link_feedforward")  # keys of [controller] for what is added to a command
+
 
 def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
     """Return what a file asks of predictive control; None where it asks for gains, or for no controller. Raises
@@ -34,6 +36,11 @@ def _check_keys(table: ProblemTable, controller: ControllerTable) -> None:
     if all(name.startswith(RESPONSE) for name in controller.robust_to):  # which its linear region is certified on
         taken.add("robust_to")
     stated = sorted(controller.model_fields_set - taken)
+    if stated and stated[0] in ADDED:
+        raise ProblemError(
+            f"controller.{stated[0]} adds to the command behind the law, and a plan keeps limits and rate of the "
+            'command itself: with structure = "mpc" it would exceed them; take it out'
+        )
     if stated:
         raise ProblemError(f'controller.{stated[0]} shapes gains, and structure = "mpc" has none; take it out')
     if not isinstance(controller.measured, str):
