@@ -23,7 +23,7 @@ from seaopt.machine.decimated import shift_command
 from seaopt.machine.differences.certified import Differences, compare
 from seaopt.machine.replay import Replay, replay
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, find_refused, join_blocks
-from seaopt.machine.response.verdicts import Response, find_friction, has_dry_friction, judge_response
+from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Source, stand
 from seaopt.machine.ticks import Ticks, take_ticks
 from seaopt.parameters import ParameterSet
@@ -241,7 +241,7 @@ def accept(
             left_out[ticks.source] = str(error)
     if not blocks:
         return replace(result, left_out=left_out)
-    response = _tell_effort(judge_response(law, join_blocks(blocks), confidence), law, rows)
+    response = judge_response(law, join_blocks(blocks), confidence)
     whole = [ticks for ticks in rows if ticks.source not in left_out]
     if has_dry_friction(law) and any(row.ticks_per_row > 1 for row in replays):
         left_out["differences"] = FEWER_TICKS
@@ -250,18 +250,9 @@ def accept(
     differences = compare(law, response.measured, whole, draws, confidence)
     first = differences.found[0] if differences is not None and differences.found else None
     if first is not None and first.kind == "rate" and first.size:  # of the machine's seconds, and none for a fit
-        response = _tell_effort(judge_response(law, join_blocks(blocks), confidence, first.size), law, rows)
+        response = judge_response(law, join_blocks(blocks), confidence, first.size)
         result = replace(result, experiments=())
     return replace(result, response=response, differences=differences, left_out=left_out)
-
-
-def _tell_effort(response: Response, controller: Controller, rows: Sequence[Ticks]) -> Response:
-    """Return a response with how much effort there was in the logs, beside what dry friction takes."""
-    friction = find_friction(controller)
-    if not friction:
-        return response
-    effort = max(float(np.ptp(ticks.command)) for ticks in rows) / 2.0 / abs(controller.per_effort)
-    return replace(response, effort=effort, friction=friction)
 
 
 def _check_header(source: Source, log: Log, row: Replay, others: Mapping[str, Controller]) -> Replay:

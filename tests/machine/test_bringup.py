@@ -11,6 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.formatting import format_number
 from seaopt.machine.bringup_files import write_bring_up
+from seaopt.machine.excitation import design_excitation
 from tests.machine.simulator import Bench, Machine
 
 SHARE = 0.4
@@ -146,6 +147,19 @@ def plan_first(rubbing, share):
     return so.bring_up(
         law, {"knee": plant}, values, samples=5, share=share, fractions=(0.25,), limits={"tau_s": 20.0}, **options
     )
+
+
+def test_what_the_fade_to_a_bias_takes_does_not_count_as_motion(compiler, tmp_path, rubbing):
+    """The motor moves on the way to a bias of 11 N m, and stays there: its friction is 6, the periods swing by 4.6."""
+    _, values, law, _ = rubbing
+    excitation = design_excitation(
+        law, share=0.6, bias=11.0, limits={"tau_s": 20.0}, seed=1, phases=6, periods=4
+    )  # fmt: skip
+    log = Bench(compiler, tmp_path, law).log(Machine.of_knee(values), excitation.reference, noise=0.01)
+    response = so.accept(law, [log]).response
+    whole, period = 100 * 0.0369 * 0.7 * log["I"], excitation.waves.shape[1]
+    assert np.ptp(whole) / 2.0 > 6.0 > np.ptp(whole[period:-period]) / 2.0
+    assert response.still and response.effort == pytest.approx(np.ptp(whole[period:-period]) / 2.0, rel=0.1)
 
 
 @pytest.mark.parametrize(("share", "moves"), [(0.5, True), (0.2, False)])

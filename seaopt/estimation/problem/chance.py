@@ -17,7 +17,9 @@ def exceeds(shape: float, x: float) -> float:
     """Return the probability that a gamma variable of this shape (and scale 1) exceeds x; of 2 `shape` degrees of
     freedom that chi-square exceeds 2 x.
     """
-    if not x > 0.0:
+    if math.isnan(x):
+        return math.nan
+    if x <= 0.0:
         return 1.0
     front = math.exp(shape * math.log(x) - x - math.lgamma(shape)) if math.isfinite(x) else 0.0
     if x < shape + 1.0:

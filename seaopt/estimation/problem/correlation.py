@@ -68,8 +68,8 @@ def find_quick_size(samples: int) -> int:
 
 
 def find_quick_size_within(samples: int) -> int:
-    """Return the largest length of quick transforms of so many samples or fewer."""
-    return int(_list_quick()[np.searchsorted(_list_quick(), samples, side="right") - 1])
+    """Return the largest length of quick transforms of so many samples or fewer, of at least one."""
+    return int(_list_quick()[np.searchsorted(_list_quick(), max(samples, 1), side="right") - 1])
 
 
 class LaggedSums:

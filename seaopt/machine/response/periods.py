@@ -64,6 +64,7 @@ class Blocks:
     rows: int  # of a period
     period_s: float
     amplitude: float  # rms of the reference about its mean
+    swing: float  # the most by which the effort swings about its middle in the periods of a log
     left_out: LeftOut
 
     @property
@@ -227,6 +228,7 @@ def _transform(
         rows=period,
         period_s=period / ticks.rate_hz,
         amplitude=float(np.sqrt(0.5 * np.mean(np.sum(np.abs(scale * reference[:, lines]) ** 2, axis=1)))),
+        swing=float(np.ptp(ticks.command[rows])) / 2.0 / abs(controller.per_effort),
         left_out=left_out,
     )
 
@@ -259,5 +261,6 @@ def _join(group: Sequence[Blocks]) -> Blocks:
         beside={name: np.concatenate([part.beside[name] for part in group]) for name in sorted(names)},
         realisation=np.concatenate([part.realisation + at for part, at in zip(group, offsets, strict=True)]),
         amplitude=float(np.mean([part.amplitude for part in group])),
+        swing=max(part.swing for part in group),
         left_out=sum((part.left_out for part in group), LeftOut()),
     )

@@ -63,13 +63,13 @@ class Response:
     at_amplitude_only: bool  # dry friction, and the gain is another one at another amplitude, or was seen at one only
     needs_phases: bool  # dry friction, and fewer than six sets of phases
     needs_lines: tuple[float, float] | None = None  # Hz, from where to where lines are to lie, where they do not
-    effort: float | None = None  # with dry friction: the most by which the effort swings about its middle in the logs
+    effort: float | None = None  # with dry friction: the most by which the effort swings about its middle in a period
     friction: float | None = None  # which dry friction takes: below it the motor does not move
     rate: float = 1.0  # of the law, over what the clock of the logs says: Hz and seconds are those of the machine
 
     @property
     def still(self) -> bool:
-        """Whether dry friction held the motor in all logs."""
+        """Whether dry friction held the motor in all periods that were judged."""
         return self.effort is not None and self.friction is not None and self.effort <= self.friction
 
     def to_dict(self) -> dict[str, Any]:
@@ -147,7 +147,8 @@ def judge_response(controller: Controller, groups: Sequence[Blocks], confidence:
     """Return the response of periods, a group per amplitude, and what it says of the controller's limits. `rate`: at
     which the law was stepped, over what the clock of the logs says.
     """
-    dry = has_dry_friction(controller)
+    friction = find_friction(controller)
+    dry = friction > 0.0
     by_phases = dry or all(group.realisations >= LEAST_PHASES for group in groups)
     by_phases = by_phases and all(group.realisations >= 2 for group in groups)
     parts = [measure(controller, group, by_phases) for group in groups]  # the law goes by ticks, whatever they last
@@ -178,6 +179,8 @@ def judge_response(controller: Controller, groups: Sequence[Blocks], confidence:
         at_amplitude_only=dry and not _is_same_gain(measured),
         needs_phases=needs_phases,
         needs_lines=needs_lines,
+        effort=max(group.swing for group in groups) if dry else None,
+        friction=friction if dry else None,
         rate=rate,
     )
 
