@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
-from seaopt.estimation.judgement.budget import Budget
 from seaopt.estimation.judgement.candidates import Candidate, list_candidates
 from seaopt.estimation.judgement.held_out import compare_held_out
 from seaopt.estimation.judgement.hypothesis_search import Refit
@@ -28,6 +27,7 @@ from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment,
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.solver.budget import Budget
 from seaopt.estimation.solver.settle import (
     ROUGH_ITERATIONS,
     Solved,

@@ -23,7 +23,6 @@ from typing import ParamSpec
 import numpy as np
 
 from seaopt.errors import SeaoptError
-from seaopt.estimation.judgement.budget import Budget
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Change, Hypothesis, change_plants, measure_sizes
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
@@ -33,6 +32,7 @@ from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_sticking
+from seaopt.estimation.solver.budget import Budget
 from seaopt.estimation.solver.least_squares import FIRST_RADIUS, find_blocked, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
 from seaopt.estimation.solver.step_shares import copy_steps

@@ -19,7 +19,6 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.estimation.judgement.another_start import find_other_minimum
-from seaopt.estimation.judgement.budget import EVALUATIONS, Budget
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.hypothesis_search import Search, search_hypotheses
@@ -33,6 +32,7 @@ from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.widening import widen
+from seaopt.estimation.solver.budget import EVALUATIONS, Budget
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant

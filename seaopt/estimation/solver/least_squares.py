@@ -40,7 +40,7 @@ ROUNDING_DECREMENT = 1e-4  # squared standard deviations that rounding may leave
 UNSEEN = 1e-14  # of the largest eigenvalue; directions below it are left where they are
 ROUNDING_RADIUS = 1e-15  # of the size of the point
 FLAT_STEPS = 6  # in a row that leave the cost as it is
-LOST_STEPS, GAIN = 8, 1e-3  # steps to where the cost is not finite, since it last fell by such a share of itself
+LOST_STEPS, GAIN = 8, 1e-2  # to where the cost is not finite, since it last fell by such a share of what is left
 NEAR_ENOUGH = 0.25  # squared standard deviations that the slope leaves where the cost is flat
 STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a few times that over the step to come
 
@@ -161,7 +161,7 @@ def minimise(
         trial = objective.evaluate(end)
         ratio = (current.cost - trial.cost) / predicted if predicted > 0.0 and np.isfinite(trial.cost) else -1.0
         lost += not np.isfinite(trial.cost)
-        if trial.cost < (1.0 - GAIN) * best:
+        if trial.cost < best - max(GAIN * 0.5 * distance, NEAR_ENOUGH):
             lost, best = 0, trial.cost
         unchanged = unchanged + 1 if flat > 0.0 and abs(trial.cost - current.cost) <= flat * current.cost else 0
         if ratio < 0.25:

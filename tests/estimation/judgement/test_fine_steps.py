@@ -10,11 +10,11 @@ import pytest
 
 import seaopt as so
 from seaopt.estimation.judgement import causes, hypothesis_search
-from seaopt.estimation.judgement.budget import EVALUATIONS, OUT_OF_PROPORTION
 from seaopt.estimation.judgement.candidates import Candidate
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Sizes, change_plants
 from seaopt.estimation.judgement.judge import OF_HYPOTHESES
 from seaopt.estimation.problem.fit_problem import FitProblem
+from seaopt.estimation.solver.budget import EVALUATIONS, OUT_OF_PROPORTION
 from seaopt.estimation.solver.settle import refine_to
 from tests.actuator_logs import integrate
 

@@ -205,6 +205,27 @@ class Wall:
         return QuadraticModel(z=z, cost=cost, gradient=apart, hessian=np.eye(1), linear=np.zeros(1, dtype=bool))
 
 
+class Valley:
+    """Rosenbrock's function (1960), which no run reaches beside its valley; `floor`: what noise adds to the cost."""
+
+    def __init__(self, floor):
+        self.floor = floor
+
+    def evaluate(self, z):
+        residuals = np.array([10.0 * (z[1] - z[0] ** 2), 1.0 - z[0]])
+        slopes = np.array([[-20.0 * z[0], 10.0], [-1.0, 0.0]])
+        cost = 0.5 * float(residuals @ residuals) + self.floor if z[1] >= z[0] ** 2 - 0.02 else np.inf
+        linear = np.zeros(2, dtype=bool)
+        return QuadraticModel(z=z, cost=cost, gradient=slopes.T @ residuals, hessian=slopes.T @ slopes, linear=linear)
+
+
+@pytest.mark.parametrize("floor", [0.0, 1e4, 1e7])
+def test_what_noise_adds_to_the_cost_does_not_end_a_search_beside_what_cannot_be_simulated(floor):
+    bounds = np.full(2, np.inf)
+    solution = minimise(Valley(floor), np.array([-1.2, 1.5]), -bounds, bounds, max_iterations=100)
+    assert solution.status == "converged" and solution.z == pytest.approx([1.0, 1.0], abs=1e-3)
+
+
 def test_a_search_ends_where_it_goes_to_what_cannot_be_simulated():
     bounds, start = np.full(1, np.inf), np.array([1.0])
     beyond = Wall(-0.5, 0.0)
