@@ -38,19 +38,19 @@ AT_START, HALF = 20, 0.5  # samples to either side, of a start; and of its cost,
 
 
 def shift_start(problem: FitProblem, start: Evaluation) -> Evaluation:
-    """Return a start with those free delays at which its simulation lies much nearer to the logs."""
+    """Return a start with those free delays at which its simulation lies much nearer to the logs: all of them together,
+    for each experiment alone is a part of the cost.
+    """
+    z = start.z.copy()
     for experiment in problem.experiments:
         index = experiment.slots.delay.index
-        if index is None or not np.isfinite(start.cost):
-            continue
-        low, high = problem.unknowns.low[index], problem.unknowns.high[index]
-        shift = _find_best_shift(experiment, start.z, low, high, AT_START)
-        if shift:
-            z = start.z.copy()
-            z[index] += shift
-            shifted = problem.evaluate(z)
-            start = shifted if shifted.cost < HALF * start.cost else start
-    return start
+        if index is not None and np.isfinite(start.cost):
+            low, high = problem.unknowns.low[index], problem.unknowns.high[index]
+            z[index] = start.z[index] + _find_best_shift(experiment, start.z, low, high, AT_START)
+    if np.array_equal(z, start.z):
+        return start
+    shifted = problem.evaluate(z)
+    return shifted if shifted.cost < HALF * start.cost else start
 
 
 def search_delays(solved: Solved, max_iterations: int, callback: Callback | None = None) -> Solved:

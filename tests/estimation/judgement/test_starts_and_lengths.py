@@ -15,6 +15,9 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.bench import PAPER_STAND
+from seaopt.estimation.problem.fit_problem import pose_problem
+from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.solver.delay_cells import shift_start
 
 TICK, RATE_HZ, HOLD_S, GAIN = 2 * np.pi / 4096, 200.0, 1e-3, 8.0
 SERVO = {"J_m": 4e-4, "J_l": 0.586 / (2 * np.pi * 11.94) ** 2, "k_s": 0.586, "c_s": 4e-4, "b_r": 2e-3, "f_c": 0.02}
@@ -142,3 +145,25 @@ def test_a_delay_that_begins_samples_off_starts_where_the_log_has_it(late_s):
     assert fit.parameters["k_s"].value == pytest.approx(SERVO["k_s"], rel=0.06)
     assert fit.parameters["T_h"].value == pytest.approx(HOLD_S, rel=0.2)
     assert fit.nuisance["experiment"].fitted["delay_s"].value < 2e-4
+
+
+def test_delays_of_several_logs_start_where_all_of_them_have_it():
+    """One delay of three halves no cost of all."""
+    t = np.arange(round(4 * RATE_HZ)) / RATE_HZ
+    plant = so.plants.let_stick(so.plants.rotary(parts=["duty_input", "position_servo", "servo_hold"]))
+    gain = so.Parameter(name="k_p", value=GAIN, unit="-")
+    params = plant.defaults.with_parameters(gain).update(**KNOWN, T_h=HOLD_S).update(**SERVO).free(*SERVO)
+    benches = []
+    for i in range(3):
+        goal = 0.15 * np.sin(2 * np.pi * (0.3 * t + 0.5 * 9.7 / 8.0 * t**2) + 0.5 * i)
+        log = so.Log.from_arrays(time=t, goal=goal, theta_m=turn_servo(goal))
+        delay = so.Parameter(name="delay", value=0.03, unit="s", free=True, max=0.05)
+        bench = so.Experiment(
+            name=f"bench {i}", plant=plant, log=log, outputs=("theta_m",), delay_s=delay, initial_state="rest"
+        )
+        benches.append(bench)
+    problem = pose_problem(tuple(benches), params, loss=Squares())
+    start = problem.evaluate(problem.unknowns.start)
+    shifted = shift_start(problem, start)
+    assert [experiment.slots.delay.at(shifted.z) for experiment in problem.experiments] == [0.0, 0.0, 0.0]
+    assert shifted.cost < 1e-3 * start.cost
