@@ -12,10 +12,11 @@ import inspect
 import os
 import sys
 import tempfile
+from collections import defaultdict
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType, SimpleNamespace
+from types import CodeType, ModuleType, SimpleNamespace
 from typing import Any, Literal, get_type_hints
 
 os.environ.setdefault("SEAOPT_CACHE_DIR", tempfile.mkdtemp(prefix="seaopt-tests-"))
@@ -56,8 +57,9 @@ checker = ModuleType("seaopt_type_checker")
 checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=OVERRIDES))
 sys.modules["seaopt_type_checker"] = checker
 
-called: list[Callable[[], None]] = []  # of functions: lets their next call be checked again
-inner: set[CodeType] = set()  # what was defined inside a function, in this test
+EVERY = 200
+numbers: dict[CodeType, int] = {}  # of functions: a hash of the code itself at every call takes longer than most calls
+calls: defaultdict[int, int] = defaultdict(int)
 
 
 def make_checked(function):
@@ -76,10 +78,9 @@ def resolve(hint, function):
 
 
 def check_calls(function):
-    """Check a function's first call in each test, and its first in what is set up for it; of a class its constructor's.
+    """Check a function's first call in each test, then one in `EVERY`; a class's constructor's.
 
-    Checking each call takes half of the tests' time, and a wrapper that counts calls a tenth: a function has the code
-    of `TRAMPOLINE` until it is called, and then its own.
+    Checking each call takes half of the tests' time. What is defined inside a function counts as one function.
     """
     if inspect.isclass(function):
         if dataclasses.is_dataclass(function) and "__init__" in vars(function):
@@ -87,49 +88,18 @@ def check_calls(function):
         return function
     if inspect.isgeneratorfunction(function):  # checked where it is first advanced, among somebody else's shapes
         return function
-    if "<locals>" in function.__qualname__:
-        return check_inner(function)
-    code, checked = function.__code__, None
-    own = FunctionType(code, function.__globals__, function.__name__, function.__defaults__, function.__closure__)
-    own.__kwdefaults__ = function.__kwdefaults__
-    own.__annotations__, own.__qualname__ = function.__annotations__, function.__qualname__
-    names = {"co_name": code.co_name, "co_freevars": code.co_freevars}
-
-    def check(*args, **kwargs):
-        nonlocal checked
-        function.__code__ = code
-        called.append(arm)
-        checked = checked or make_checked(own)
-        with shapes_of_one_call():
-            return checked(*args, **kwargs)
-
-    def arm():
-        function.__code__ = TRAMPOLINE.replace(co_consts=(None, check), **names)
-
-    function.__wrapped__ = own  # whose signature and source it is
-    arm()
-    return function
-
-
-# Its constant becomes the function that checks.
-TRAMPOLINE = (lambda *args, **kwargs: "check".__call__(*args, **kwargs)).__code__
-
-
-def check_inner(function):
-    """Check the first call of what is defined first in a test inside a function, without a code for each definition."""
-    if function.__code__ in inner:
-        return function
-    inner.add(function.__code__)
-    checked = False
+    number, checked = numbers.setdefault(function.__code__, len(numbers)), None
 
     @functools.wraps(function)
     def call(*args, **kwargs):
         nonlocal checked
-        if checked:
+        calls[number] = count = calls[number] + 1
+        if count > 1 and count % EVERY:
             return function(*args, **kwargs)
-        checked = True
+        if checked is None:
+            checked = make_checked(function)
         with shapes_of_one_call():
-            return make_checked(function)(*args, **kwargs)
+            return checked(*args, **kwargs)
 
     return call
 
@@ -139,24 +109,9 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
-    """Check anew, so that what a test checks does not depend on the tests before it."""
-    arm_again()
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_call() -> None:
-    """Check what a test calls that its fixtures called, too."""
-    arm_again()
-
-
-def arm_again() -> None:
-    """Check the next call of each function that was called."""
-    for arm in called:
-        arm()
-    called.clear()
-    inner.clear()
+    """Count calls anew, so that what a test checks does not depend on the tests before it."""
+    calls.clear()
 
 
 shapes_of_one_call = partial(jaxtyping.jaxtyped, "context")
