@@ -159,7 +159,7 @@ def test_delays_of_several_logs_start_where_all_of_them_have_it():
         log = so.Log.from_arrays(time=t, goal=goal, theta_m=turn_servo(goal))
         delay = so.Parameter(name="delay", value=0.03, unit="s", free=True, max=0.05)
         bench = so.Experiment(
-            name=f"bench {i}", plant=plant, log=log, outputs=("theta_m",), delay_s=delay, initial_state="rest"
+            name=f"bench_{i}", plant=plant, log=log, outputs=("theta_m",), delay_s=delay, initial_state="rest"
         )
         benches.append(bench)
     problem = pose_problem(tuple(benches), params, loss=Squares())
