@@ -35,16 +35,19 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
 
 
 def say_bandwidths(controller: Controller, bandwidth_hz: float | None) -> str:
-    """Return a bandwidth; where friction makes two of it, with the one that is left while it sticks, and where it falls
-    with the speed, from the one where it slides fast.
+    """Return a bandwidth; where friction makes two of it, with the one that is left while it sticks."""
+    moving, stuck = _say_sliding(controller, bandwidth_hz), show_stuck_bandwidth(controller)
+    return f"{moving} and {stuck} Hz stuck" if stuck else moving
+
+
+def _say_sliding(controller: Controller, bandwidth_hz: float | None) -> str:
+    """Return a bandwidth; of a plant with friction as that where it slides, and where friction falls with the speed
+    from the one where it slides fast.
     """
-    moving, stuck = format_figure(bandwidth_hz, "Hz", missing="none"), show_stuck_bandwidth(controller)
-    fast = _measure_fast(controller)
+    moving, fast = format_figure(bandwidth_hz, "Hz", missing="none"), _measure_fast(controller)
     if fast is not None and bandwidth_hz is not None:
         low, high = sorted((fast, bandwidth_hz))
         moving = f"{format_number(low, 3)} to {format_figure(high, 'Hz')}"
-    if stuck:
-        return f"{moving} sliding and {stuck} Hz stuck"
     return f"{moving} sliding" if _measure_stuck(controller) else moving
 
 
@@ -111,8 +114,10 @@ def summarise(controller: Controller) -> list[KeyFigure]:
     achieved, spec, on = controller.achieved, controller.spec, "design plant"
     ms, gain_unit = spec.level("max_sensitivity"), controller.command.gain_unit
     asked, allowed = f"asked {spec.bandwidth_hz:g} Hz", "" if ms is None else f"at most {ms:g}"
+    if stuck := show_stuck_bandwidth(controller):
+        asked = f"{stuck} Hz stuck, {asked}"
     return [
-        KeyFigure(name="bandwidth", value=say_bandwidths(controller, achieved.bandwidth_hz), against=asked),
+        KeyFigure(name="bandwidth", value=_say_sliding(controller, achieved.bandwidth_hz), against=asked),
         KeyFigure(name="Ms", value=format_number(achieved.ms, 3), against=allowed),
         KeyFigure(name="phase margin", value=format_figure(achieved.phase_margin_deg, "deg", 3), against=on),
         KeyFigure(name="noise gain", value=format_figure(achieved.noise_gain, gain_unit, 3), against=on),
