@@ -13,6 +13,7 @@ from seaopt.cli.provenance import FILES, digest
 from seaopt.cli.session import OWN_LAW, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.codec import from_content, to_content
+from seaopt.control.deploy.c_text import strip_markup
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.deploy.target import Tare
 from seaopt.control.laws.plausibility import Agreement, GateSpec, PlausibilityGate
@@ -221,7 +222,7 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
     if not options.pop("allow_infeasible", False) and not content["feasible"]:
         missed = join_labels(content["active_constraints"])
         raise ProblemError(f"the controller misses {missed}; tune one that does not, or type --allow-infeasible")
-    gate, derate, _ = options.pop("gate"), options.pop("derate"), options.pop("uncertified")
+    gate, derate, uncertified = options.pop("gate"), options.pop("derate"), options.pop("uncertified")
     typed = {name for name, value in options.items() if value not in (None, False) and name != "precision"}
     if typed - {"name"} or options["name"] != "force_law":
         raise ProblemError(
@@ -238,7 +239,9 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
         if derate and guard is None:
             raise ProblemError("--derate: nothing is known of the motor's heat; tune on a plant with the part thermal")
         code = set_heat(code, guard if derate else None)
-    folder = write_code(code, target, single_precision=options["precision"] == "float")
+    folder = write_code(
+        code, target, single_precision=options["precision"] == "float", uncertified=strip_markup(uncertified)
+    )
     return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h", *code.parts))
 
 

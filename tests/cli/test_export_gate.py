@@ -180,6 +180,7 @@ def test_predictive_control_takes_both(tuned, folder, compiler, seaopt):
     mpc = design_mpc(problem, problem.parameters)
     assert mpc.gate.max_held == 8
     compare_plans(LoadedMPC(compiler, code), mpc)
+    assert "/* NOT CERTIFIED: seaopt certify was not run" in (code / "force_mpc_data.h").read_text(encoding="utf-8")
     bare = force_mpc(*mpc.design, mpc.spec)
     typed = ("--gate", "-4000:4000", "--gate-max-step", "300", "--gate-max-held", "3")
     assert seaopt("export", "out", "--c", "typed", *typed).returncode == 1

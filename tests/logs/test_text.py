@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import seaopt as so
 from seaopt.errors import LogError, UnitError
 from seaopt.logs import Column, contents, read_log, read_table
 from seaopt.logs.formats.text_layout import _join_quoted_lines, _number_header
@@ -213,6 +214,17 @@ def test_an_index_in_brackets_is_no_unit(file):
 def test_headers_that_repeat_are_numbered_and_those_over_two_lines_joined():
     assert _number_header("X [s]", 3) == "X#3 [s]"
     assert _join_quoted_lines(['t,"I', '[A]",F1', "x"]) == ['t,"I [A]",F1', "", "x"]
+
+
+@pytest.mark.parametrize(
+    ("header", "rate_hz"),
+    [("time [s],clock", 1000), ("t [s],stamp", 1000), ("t_s,Clock", 1000), ("u,clock [us]", 1e6 / 24_000)],
+)
+def test_a_counter_named_clock_is_the_time_where_nothing_else_is(tmp_path, header, rate_hz):
+    path, t = tmp_path / "log.csv", np.arange(200) * 1e-3
+    rows = "\n".join(f"{at},{24_000 * i},{np.sin(at)}" for i, at in enumerate(t))
+    path.write_text(f"{header},F1 [N]\n{rows}")
+    assert so.read_log(path, channels={"F1": "F1 [N]"}).rate_hz == pytest.approx(rate_hz)
 
 
 def test_columns_named_like_a_time_and_columns_that_wrap():

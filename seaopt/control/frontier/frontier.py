@@ -105,6 +105,10 @@ def sweep(
     spec, params = settle_delays(spec, design, params)
     # What is wrong with any row is said before the first is tuned.
     specs = [replace(spec, bandwidth_hz=require_number(f, "bandwidths_hz", ControlError)) for f in bandwidths_hz]
+    if over is None and len(points):
+        raise ControlError(
+            f"points = {list(points)} without over: a schedule's are meant; name its variable, or leave them out"
+        )
     if over is not None:
         if isinstance(plant, MeasuredResponse):
             raise ControlError(

@@ -75,12 +75,12 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
     return write_code(collect_code(mpc), folder, single_precision=single_precision)
 
 
-def write_code(code: MPCCode, folder: Path | str, *, single_precision: bool = False) -> Path:
-    """Write a controller's C code, as `export_mpc`."""
+def write_code(code: MPCCode, folder: Path | str, *, single_precision: bool = False, uncertified: str = "") -> Path:
+    """Write a controller's C code, as `export_mpc`. `uncertified`: why it is not certified, for a comment."""
     target = Path(folder)
     for name in SOURCES:
         write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
-    write_text(target / "force_mpc_data.h", _format_data(code, single_precision))
+    write_text(target / "force_mpc_data.h", _format_data(code, single_precision, uncertified))
     for name, part in code.parts.items():
         write_text(target / name, part)
     return target
@@ -143,7 +143,7 @@ def set_gate(code: MPCCode, gate: PlausibilityGate | None, sample_time_s: float)
     return replace(code, sizes=sizes, numbers=numbers)
 
 
-def _format_data(code: MPCCode, single_precision: bool) -> str:
+def _format_data(code: MPCCode, single_precision: bool, uncertified: str) -> str:
     program = factor_program(code.hessian, code.rows)
     tolerance, dependent = (TOLERANCE_SINGLE, DEPENDENT_SINGLE) if single_precision else (TOLERANCE, DEPENDENT)
     numbers = {**code.numbers, "tolerance": tolerance, "dependent": dependent}
@@ -156,6 +156,7 @@ def _format_data(code: MPCCode, single_precision: bool) -> str:
     return "\n".join(
         [
             "/* Sizes and numbers of one controller. */",
+            *([f"/* NOT CERTIFIED: {uncertified} */"] if uncertified else []),
             "#ifndef FORCE_MPC_DATA_H",
             "#define FORCE_MPC_DATA_H",
             *lines,

@@ -22,6 +22,7 @@ from seaopt.records import record
 from seaopt.signals import check_distinct
 from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
+COUNTERS = ("clock", "stamp")  # names of a time where nothing else has one, and of ticks beside it
 _TIME_ENDING = re.compile(r"[_ ](s|ms|us|ns)$")
 MAX_NAMES = 20  # in a message
 HOW_TO_ALIGN = "align it by Hold(), Linear(), Nearest(tolerance_s=...) or Readings()"
@@ -337,7 +338,9 @@ def _find_time_column(source: Source) -> Column:
     names = [field.name for field in source.fields if field.numeric]
     lengths = {field.name: field.length for field in source.fields}
     named = [field for field in source.fields if field.numeric and is_time_name(field.header or field.name)]
-    if not named:
+    plain = [field for field in named if bare_name(field.header or field.name).casefold() not in COUNTERS]
+    named = plain or named
+    if not plain:
         endings = {
             field.name: _TIME_ENDING.search(field.name) for field in source.fields if field.numeric and not field.unit
         }

@@ -140,3 +140,8 @@ def test_the_command_writes_table_json_and_figure(tmp_path, monkeypatch, capsys)
 def test_bad_sweeps(text):
     with pytest.raises(ControlError, match="--sweep"):
         parse_bandwidths(text)
+
+
+def test_points_without_a_variable_are_refused(thor):
+    with pytest.raises(so.SeaoptError, match=r"points = .* without over"):
+        sweep(so.plants.high_impedance(), thor, so.ControllerSpec(), [20], points=[5e5, 6e5])
