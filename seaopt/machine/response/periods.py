@@ -11,6 +11,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from seaopt.control import Controller, GateState
 from seaopt.errors import LogError
 from seaopt.formatting import format_count, join_words
+from seaopt.machine.response.runaway import say_runaway
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
@@ -185,7 +186,8 @@ def cut_periods(
     """
     period, seconds = find_period(ticks.reference), 1.0 / ticks.rate_hz
     if period is None:
-        raise LogError(f"{ticks.source}: {_say_aperiodic(len(ticks) * seconds, played)}")
+        why = say_runaway(controller, ticks) or _say_aperiodic(len(ticks) * seconds, played)
+        raise LogError(f"{ticks.source}: {why}")
     stretches = _find_stretches(ticks.reference, period)
     starts = [  # first row, stretch
         (first + period * k, number) for number, (first, whole) in enumerate(stretches) for k in range(TRANSIENT, whole)
@@ -197,6 +199,8 @@ def cut_periods(
     both = sum(map(all, zip(limited, gated, strict=True)))
     left_out = LeftOut(limit=sum(limited), gate=sum(gated) - both, gap=ticks.left_out // period)
     if len(free) < 2:
+        if (away := say_runaway(controller, ticks)) is not None:
+            raise LogError(f"{ticks.source}: {away}")
         why = join_words(say_left_out(left_out)) or "record more"
         if (stays := float(np.mean(at_limit))) > STAYS:
             why = f"its command stays at the limit ({stays:.0%} of the ticks): check the signs of command and readings"
