@@ -186,12 +186,15 @@ def test_a_fault_within_reach_of_the_draws_at_each_line_is_outside_of_all_of_the
     controller, bench, ranges, fault, factor
 ):
     machine = scale(per_ampere=1.05, damping=1.5, **{fault: factor})
-    options = {"uncertainty": so.plants.thor(), "ranges": ranges}
-    result = so.accept(controller, [bench.log(machine, REFERENCE)], **options)
+    result = so.accept(controller, [bench.log(machine, REFERENCE)], uncertainty=so.plants.thor(), ranges=ranges)
     assert result.differences.each_line and not result.differences.inside
     assert "none of them explains all lines together" in " ".join(str(result).split())
-    right = bench.log(scale(per_ampere=1.05, damping=1.5), REFERENCE)
-    assert so.accept(controller, [right], **options).differences.inside
+
+
+@pytest.mark.parametrize("ranges", [WIDE, WIDER])
+def test_without_the_fault_it_is_inside(controller, bench, ranges):
+    log = bench.log(scale(per_ampere=1.05, damping=1.5), REFERENCE)
+    assert so.accept(controller, [log], uncertainty=so.plants.thor(), ranges=ranges).differences.inside
 
 
 def test_between_the_draws_a_machine_is_found_by_going_on_from_the_nearest(controller, bench):

@@ -270,7 +270,10 @@ def test_with_dry_friction_fewer_than_six_sets_of_phases_confirm_nothing(dry):
     assert response.needs_phases and {row.outcome for row in response.judged} == {"undecided"}
     assert "0 of 5 limits confirmed, 0 refuted" in text
     assert "its bandwidth is 30 Hz sliding and" in text
-    assert "the log does not decide stability, Ms, Mt, reference peak and bandwidth: record 6 sets of random" in text
+    assert (
+        "the log does not decide stability, Ms, Mt, reference peak and bandwidth, stuck: record 6 sets of random"
+        in text
+    )
 
 
 def test_turns_of_a_loop_that_friction_holds_are_counted_beside_the_stuck_plant(compiler, tmp_path):
