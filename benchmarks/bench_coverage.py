@@ -22,6 +22,9 @@ servo
     An elastic joint under a firmware's PD by its goal and one encoder of 512 steps (`problems/elastic_joint.py`,
     simulated there); a delay is free.
 
+`--kept FILE` keeps what each seed gives, so that a run goes on where it was stopped; `--as-kept` makes the page of the
+seeds that are there.
+
 What the model lacks is the matter of `truth/run.py`, whose kept cases (--truth FILE...) go into the page as a case.
 
 A covariance is right when the scatter of the estimates over seeds is the stated std, and each interval holds the
@@ -42,6 +45,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads cost these small problems more than they bring
 
@@ -158,9 +162,9 @@ def sticking(actuator: actuators.Actuator, seed: int) -> so.Fit:
     current, ideal = play(actuator.kind, actuator.link)
     rng = np.random.default_rng([seed, 3])
     readings = {name: values + NOISE.get(name, 0.0) * rng.normal(size=values.size) for name, values in ideal.items()}
-    for name in STEP.keys() & readings.keys():
-        step = STEP[name]
-        readings[name] = step * np.round(readings[name] / step + rng.uniform())
+    for name, step in STEP.items():
+        if name in readings:
+            readings[name] = step * np.round(readings[name] / step + rng.uniform())
     log = so.Log.from_arrays(time=np.arange(current.size) / actuators.RATE_HZ, I=current, **readings)
     plant, params, delay = pose(actuator, actuator.truth)
     params = params.update(**{name: 1.1 * params[name].value for name in list_free(actuator)})
@@ -215,14 +219,34 @@ def find_errors(job: tuple[str, int]) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return error, by_noise, std, float(error / std @ np.linalg.solve(correlation, error / std)), fit.met
 
 
-def figures(name: str, seeds: int, workers: int = 1) -> dict[str, dict[str, float]]:
+KEYS = ("error", "noise", "std", "radius", "met")  # of a kept row, what `find_errors` returns
+
+
+def read_kept(file: Path | None, name: str) -> dict[int, tuple[Any, ...]]:
+    """Return the kept rows of a case, by seed."""
+    lines = file.read_text(encoding="utf-8").splitlines() if file is not None and file.exists() else []
+    rows = (row for row in map(json.loads, lines) if row["case"] == name)
+    return {row["seed"]: tuple(row[key] for key in KEYS) for row in rows}
+
+
+def list_rows(name: str, seeds: int, workers: int, kept: Path | None) -> list[tuple[Any, ...]]:
+    """Return the rows of a case's seeds; those that are not kept are made, and kept as they come."""
+    known = read_kept(kept, name)
+    jobs = [(name, seed) for seed in range(seeds) if seed not in known]
+    pool = ProcessPoolExecutor(workers) if workers > 1 and jobs else None
+    made = map(find_errors, jobs) if pool is None else pool.map(find_errors, jobs, chunksize=5)
+    for (_, seed), row in zip(jobs, made, strict=True):
+        known[seed] = row
+        if kept is not None:
+            values = {key: np.asarray(value).tolist() for key, value in zip(KEYS, row, strict=True)}
+            with kept.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"case": name, "seed": seed, **values}) + "\n")
+    return [known[seed] for seed in range(seeds)]
+
+
+def figures(name: str, seeds: int, workers: int = 1, kept: Path | None = None) -> dict[str, dict[str, float]]:
     """Return a parameter's figures each, the coverage of the ellipsoid, and the share of fits that are met."""
-    jobs = [(name, seed) for seed in range(seeds)]
-    if workers == 1:
-        rows = list(map(find_errors, jobs))
-    else:
-        with ProcessPoolExecutor(workers) as pool:
-            rows = list(pool.map(find_errors, jobs, chunksize=5))
+    rows = list_rows(name, seeds, workers, kept)
     truth = CASES[name].truth
     error, by_noise, std, radius, met = (np.array(column) for column in zip(*rows, strict=True))
     mean = np.mean(by_noise, axis=0)
@@ -272,20 +296,26 @@ def main() -> None:
     parser.add_argument("seeds", type=int, nargs="?", default=2000)
     parser.add_argument("--case", choices=list(CASES), action="append", help="every case if left out")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--kept", type=Path, help="a file of rows that are kept, and not made again")
+    parser.add_argument("--as-kept", action="store_true", help="tables of the first seeds that are kept, however many")
     parser.add_argument("--truth", type=Path, nargs="*", default=[], help="kept cases of truth/run.py")
     parser.add_argument("--page", type=Path, help="write a page, besides what is printed")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     names = given.case or list(CASES)
     if given.json:
-        print(json.dumps({name: figures(name, given.seeds, given.workers) for name in names}))
+        print(json.dumps({name: figures(name, given.seeds, given.workers, given.kept) for name in names}))
         return
-    made = f"Made by `python benchmarks/bench_coverage.py {given.seeds}`, whose text says what the cases are.\n"
+    made = f"Made by `python benchmarks/bench_coverage.py {given.seeds}`, whose text says what the cases are"
+    made += "; of each as many logs as there was time for.\n" if given.as_kept else ".\n"
     lines = ["# How often intervals hold the truth\n", made]
     print(*lines, sep="\n")
     for name in names:
         started = time.perf_counter()
-        table = list(tabulate(name, figures(name, given.seeds, given.workers), given.seeds))
+        there = read_kept(given.kept, name).keys()
+        whole = next(seed for seed in range(given.seeds + 1) if seed not in there or seed == given.seeds)
+        seeds = whole if given.as_kept else given.seeds
+        table = list(tabulate(name, figures(name, seeds, given.workers, given.kept), seeds))
         print(*table, f"({time.perf_counter() - started:.0f} s)", sep="\n", flush=True)
         lines += table
     lines += tabulate_truth(given.truth) if given.truth else []
