@@ -426,9 +426,9 @@ def _excite(controller: Controller, options: Mapping[str, Any]) -> tuple[Excitat
     """Return the reference of a stage; of a plant with dry friction the effort that it makes and the friction, with an
     amplitude that moves the motor where the largest share of the limits, "most", allows it.
     """
-    keys, dry = ("bias", "limits", "seed"), has_dry_friction(controller)
-    phases, periods = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
-    given = {key: options[key] for key in keys} | {"phases": phases, "periods": periods}
+    dry = has_dry_friction(controller)
+    given: dict[str, Any] = {key: options[key] for key in ("bias", "limits", "seed")}
+    given["phases"], given["periods"] = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
     share, most, friction = options["share"], options["most"], find_friction(controller)
 
     def play(share: float) -> tuple[Excitation, LoopRun | None, float | None]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 import seaopt as so
 from seaopt.cli.main import app
+from seaopt.files import write_json
 from tests.c_code import CompiledLog
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
@@ -130,6 +132,23 @@ def test_what_is_advised_of_an_uneven_clock_or_none_can_be_written_and_does(fold
     assert done.exit_code == 0, done.output
     (row,) = json.loads((folder / "out" / "acceptance.json").read_text())["replay"]["logs"]
     assert row["rate_hz"] == pytest.approx(1000.0) and row["ticks"] == (5000 if clock == "jitter" else len(log))
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_no_length_is_advised_from_a_bring_up_of_another_law(folder, accept, tmp_path, again):
+    """The stage's folder has the law that was planned, and the problem's may have been tuned again since."""
+    planned, law = folder / "out" / "bringup", json.loads((folder / "out" / "controller.json").read_text())
+    reference = {"period_s": 4.0, "periods": 10, "phases": 1}
+    law["law"] |= {"D": [2.0 * value for value in np.ravel(law["law"]["D"]).tolist()]} if again else {}
+    write_json(planned / "full" / "controller.json", law)
+    stages = [{"name": "full", "reference": reference}]
+    write_json(planned / "bringup.json", {"schema": "seaopt/bringup/1", "stages": stages})
+    log = so.read_log(folder / "good.csv")
+    so.write_log(log.between(0.0, 0.9), tmp_path / "short.csv")
+    done = " ".join(accept(tmp_path / "short.csv").output.split())
+    shutil.rmtree(planned)
+    assert ("shorter than one period" in done) is not again, done
+    assert ("does not repeat" in done) is again
 
 
 def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
