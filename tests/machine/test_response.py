@@ -76,6 +76,13 @@ def run_at(bench, machine, rate):
     return so.Log.from_arrays(time=1e-3 * np.arange(len(run)), **signals)
 
 
+def test_a_loop_that_another_rate_takes_near_its_limit_of_stability_is_told_to_check_it(controller, bench):
+    """At half its rate the command is at its limit in each period, so that there is no response to tell it by."""
+    result = so.accept(controller, [run_at(bench, Machine(), 0.5)])
+    (text,) = result.left_out.values()
+    assert not result.met and "beyond: check the rate at which the law is stepped" in text
+
+
 @pytest.mark.parametrize("rate", [0.5, 2.0])
 def test_a_law_at_another_rate_is_named_by_its_response_where_the_clock_of_the_log_counts_ticks(
     compiler, tmp_path, controller, rate

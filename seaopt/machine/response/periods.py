@@ -23,6 +23,10 @@ REPEATS = 0.2  # of the rows, that repeat after a period at least
 SAME = 1e-4  # of the reference's range: rows that are alike
 WEAKEST = 1e-2  # of the strongest line
 STAYS = 0.9  # of the ticks at the limit: a loop that ran away, and no amplitude that is too large
+NEAR_UNSTABLE = (
+    "or, where the amplitude is the one that was planned, the loop is near its limit of stability or beyond: check the "
+    "rate at which the law is stepped, its delay, signs and units"
+)
 TRANSIENT = 1  # periods that are left out at the start of each stretch
 SAME_AMPLITUDE = 0.1  # relative
 
@@ -202,6 +206,8 @@ def cut_periods(
         if (away := say_runaway(controller, ticks)) is not None:
             raise LogError(f"{ticks.source}: {away}")
         why = join_words(say_left_out(left_out)) or "record more"
+        if limited and all(limited):
+            why = f"{why} ({NEAR_UNSTABLE})"
         if (stays := float(np.mean(at_limit))) > STAYS:
             why = f"its command stays at the limit ({stays:.0%} of the ticks): check the signs of command and readings"
         raise LogError(
