@@ -32,6 +32,7 @@ from seaopt.robustness import check_ranges
 from seaopt.units import unit_after
 
 DRAWS, SEED = 200, 1
+EXPLAINED = 0.95  # of the difference, from which on another rate is what the figures are stated at
 FEWER_TICKS = (
     "a machine with dry friction is compared with its model by simulation under the reference of every tick, which a "
     "log of every n-th has not"
@@ -249,7 +250,8 @@ def accept(
     draws = list_draws(law, uncertainty, ranges, DRAWS, SEED)
     differences = compare(law, response.measured, whole, draws, confidence)
     first = differences.found[0] if differences is not None and differences.found else None
-    if first is not None and first.kind == "rate" and first.size:  # of the machine's seconds, and none for a fit
+    if first is not None and first.kind == "rate" and first.size and first.explains >= EXPLAINED:
+        # The figures are of the machine's seconds, and the log is none for a fit.
         response = judge_response(law, join_blocks(blocks), confidence, first.size)
         result = replace(result, experiments=())
     return replace(result, response=response, differences=differences, left_out=left_out)

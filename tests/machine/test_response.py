@@ -10,6 +10,7 @@ import pytest
 import scipy.stats
 
 import seaopt as so
+from seaopt.machine.design_run import run_design
 from seaopt.machine.excitation import design_excitation
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.measured_margins import list_margins
@@ -81,6 +82,20 @@ def test_a_loop_that_another_rate_takes_near_its_limit_of_stability_is_told_to_c
     result = so.accept(controller, [run_at(bench, Machine(), 0.5)])
     (text,) = result.left_out.values()
     assert not result.met and "beyond: check the rate at which the law is stepped" in text
+
+
+@pytest.mark.parametrize("factors", [{"k": 1.5, "J": 0.7}, {"k": 1 / 1.5, "J": 1 / 0.7}])
+def test_a_machine_of_other_values_is_not_one_at_another_rate(controller, factors):
+    """It is as fast as the certified one at 683 Hz or 1463 Hz would be, and no timer runs at those."""
+    base = controller.design[1]
+    values = base.update(**{name: base[name].value * factor for name, factor in factors.items()})
+    run = run_design(controller, [values], REFERENCE)
+    log = so.Log.from_arrays(
+        time=1e-3 * np.arange(REFERENCE.size), reference=REFERENCE, F1=run.outputs["F1"][0], I=run.current[0]
+    )
+    result = so.accept(controller, [log], uncertainty=base, ranges={"eta": (0.95, 1.05), "b_r": (1.0e-4, 1.6e-4)})
+    assert result.response.rate == 1.0 and len(result.experiments) == 1
+    assert not any(each.kind == "rate" for each in result.differences.found)
 
 
 @pytest.mark.parametrize("rate", [0.5, 2.0])

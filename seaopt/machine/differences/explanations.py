@@ -46,7 +46,7 @@ LEAST_DAMPING, MOST_DAMPED = math.log(1e-4), 0.3
 RATES = np.geomspace(0.1, 10.0, 61)  # over that of the clock, at which the law is tried to be stepped
 USUAL_RATES = (0.5, 2.0, 0.1, 0.2, 0.25, 1.0 / 3.0, 3.0, 4.0, 5.0, 10.0)  # the first two are tried always
 SAME_RATE = 0.01  # relative: a rate that is a usual one
-RATE_COST = 2.0  # by which a usual rate may leave more than another cause does, and any other has to leave less
+RATE_COST = 2.0  # by which such a rate may leave more than another cause does
 MOST = 4  # causes that are listed
 
 Slopes = Complex[np.ndarray, "n m"]
@@ -91,7 +91,7 @@ class _Tried:
     def rank(self) -> float:
         """What it leaves, times what its kind costs."""
         if self.difference.kind == "rate":
-            return self.left * (1.0 / RATE_COST if self.difference.size in USUAL_RATES else RATE_COST)
+            return self.left / RATE_COST
         return self.left * (MODE_COST if self.difference.kind == "mode" else 1.0)
 
 
@@ -258,8 +258,9 @@ def _step(comparison: Comparison, spread: Spread, values: ParameterSet, factors:
 
 
 def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> Iterator[_Tried]:
-    """Yield the rate of the law's ticks that fits best. Law and log both go by ticks, so that the replay of a log whose
-    clock counts them does not tell it; the machine goes by seconds, and its response does.
+    """Yield the rate of the law's ticks that fits best, where timers run at such a one: a machine of other inertia and
+    stiffness is like one at any. Law and log both go by ticks, so that the replay of a log whose clock counts them does
+    not tell it; the machine goes by seconds, and its response does.
     """
 
     def at(log: float) -> Comparison:
@@ -285,7 +286,9 @@ def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> I
             break
     assert best is not None
     far, rate = 1.96 * best.std, math.exp(log)
-    rate = next((each for each in USUAL_RATES if abs(rate / each - 1.0) <= SAME_RATE), rate)
+    rate = next((each for each in USUAL_RATES if abs(rate / each - 1.0) <= SAME_RATE), None)
+    if rate is None:
+        return
     value = rate / comparison.controller.sample_time_s
     low, high = (value * math.exp(-far), value * math.exp(far)) if far < MOST_SPREAD else (None, None)
     difference = Difference(
