@@ -285,7 +285,8 @@ def _find_damper(experiments: Sequence[Experiment], params: ParameterSet) -> Par
     """Return what damps the spring of all plants, where it is fixed."""
     names = {None if e.plant.spring is None else e.plant.spring.damper for e in experiments}
     name = names.pop() if len(names) == 1 else None
-    return params[name] if name in params and not params[name].free else None
+    damper = None if name is None else params.get(name)
+    return None if damper is None or damper.free else damper
 
 
 def _state_delay(of: str, late: float, value: float) -> str:
