@@ -548,9 +548,16 @@ class Session:
                 verdicts.append(Verdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
             result = result if self.problem.mpc is None else self.plan()
         again = self._spell("run" if self.problem.table.experiment else "tune")
-        fitted = dict.fromkeys(table.plant for table in self.problem.table.experiment if table.use == "fit")
+        recipes = {
+            table.plant: self.problem.plants[table.plant].recipe
+            for table in self.problem.table.experiment
+            if table.use == "fit"
+        }
         commands = Commands(
-            fit=self._spell("fit"), tune=self._spell("tune"), certify=again, plants=tuple(fitted) or Commands().plants
+            fit=self._spell("fit"),
+            tune=self._spell("tune"),
+            certify=again,
+            plants={name: () if recipe is None else tuple(recipe.parts) for name, recipe in recipes.items()},
         )
         verdict = judge(result, commands)
         assert verdict is not None

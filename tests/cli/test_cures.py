@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import re
 import tomllib
+from types import SimpleNamespace
 
 import pytest
 
 import seaopt as so
+from seaopt.estimation.result.findings import FitFinding
+from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.problem.stages import fit_problem
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
+from seaopt.reporting.sections.kinds.fit import _list_cures
 from tests.actuator_logs import write_csv
 from tests.estimation.judgement.test_late_or_damped import DAMPER, record
 
@@ -66,10 +70,26 @@ def test_what_comes_next_is_written_as_it_stands(tmp_path, damper, delay):
     problem = so.read_problem(path)
     fit = fit_problem(problem)
     assert not fit.met
-    for advice in judge(fit, Commands(plants=tuple(problem.plants))).next:
+    for advice in judge(fit, Commands(plants=dict.fromkeys(problem.plants, ()))).next:
         text = write_under(text, advice)
     path.write_text(text, encoding="utf-8")
     mended = so.read_problem(path)
     fit = fit_problem(mended)
     assert fit.met
     assert fit.parameters["c_s"].value == pytest.approx(damper, rel=0.01)
+
+
+def test_each_plant_keeps_its_own_parts():
+    """A held joint with a current loop and a link that cogs, which both take a damper in the spring."""
+    trial = HypothesisTrial(
+        effect="a damper", parts=("spring_damping",), outcome="adopted", excess_before=3.0, excess=1.0,
+        frees={"c_k": 600.0}, fixed={}, parameters={}, evaluations=9,
+    )  # fmt: skip
+    cause = FitFinding(
+        severity="error", kind="cause", where="tau_s", text="", preferred={"c_k": (600.0, 1.0)}, together=("c_k",)
+    )
+    fit = SimpleNamespace(findings=(cause,), hypotheses=(trial,), parameters={}, experiments=())
+    held, swing, values = _list_cures(fit, {"held": ("current_loop",), "swing": ("cogging",)})
+    assert held.endswith('\nparts = ["current_loop", "spring_damping"]') and "[plant.held]" in held
+    assert swing.endswith('\nparts = ["cogging", "spring_damping"]') and "[plant.swing]" in swing
+    assert values.endswith("\nc_k = { value = 600, free = true }")

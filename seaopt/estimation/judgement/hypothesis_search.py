@@ -31,7 +31,7 @@ from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment,
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.result.trials import HypothesisTrial, Outcome, state_sticking
+from seaopt.estimation.result.trials import HypothesisTrial, Outcome, spell_parameters, spell_parts
 from seaopt.estimation.solver.budget import Budget
 from seaopt.estimation.solver.least_squares import FIRST_RADIUS, find_blocked, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
@@ -103,11 +103,8 @@ class Refit:
     def proposal(self) -> str:
         """The lines of a problem file that add its parts to a plant NAME, with their parameters."""
         recipe = self.change.experiments[0].plant.recipe
-        parts = dict.fromkeys((*(recipe.parts if recipe else ()), *self.change.parts))
-        rows = [f"{name} = {{ value = {value:g}, free = true }}" for name, value in self.frees.items()]
-        rows += [f"{name} = {value:g}" for name, value in self.fixed.items()]
-        listed = ", ".join(f'"{part}"' for part in parts)
-        return "\n".join(["[plant.NAME]", f"parts = [{listed}]", *state_sticking(parts), "[parameters]", *rows])
+        parts = spell_parts((*(recipe.parts if recipe else ()), *self.change.parts))
+        return "\n".join(["[plant.NAME]", *parts, "[parameters]", *spell_parameters(self.frees, self.fixed)])
 
     @property
     def python(self) -> str:

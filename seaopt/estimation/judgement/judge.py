@@ -460,7 +460,7 @@ def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, Score
     refit = rivals[0].refit
     yield replace(
         finding,
-        preferred={name: value for cause in rivals for name, value in cause.preferred.items()},
+        preferred={name: value for cause in reversed(rivals) for name, value in cause.preferred.items()},
         together=tuple(rivals[0].preferred) or None,
         proposal="[plant.NAME]\nsticks = true" if rivals[0].jumps else refit and refit.proposal,
         python="plant = so.plants.let_stick(plant)" if rivals[0].jumps else refit and refit.python,

@@ -16,6 +16,19 @@ def state_sticking(parts: Iterable[str]) -> list[str]:
     return ["sticks = false"] if "lugre" in parts else []
 
 
+def spell_parts(parts: Iterable[str]) -> list[str]:
+    """Return the lines of a plant's table in a problem file that give it parts."""
+    named = list(dict.fromkeys(parts))
+    listed = ", ".join(f'"{part}"' for part in named)
+    return [f"parts = [{listed}]", *state_sticking(named)]
+
+
+def spell_parameters(frees: Mapping[str, float], fixed: Mapping[str, float]) -> list[str]:
+    """Return the lines of [parameters] that a part's parameters take."""
+    rows = [f"{name} = {{ value = {value:g}, free = true }}" for name, value in frees.items()]
+    return [*rows, *(f"{name} = {value:g}" for name, value in fixed.items())]
+
+
 @record
 class HypothesisTrial:
     """What a refit with one or two more effects left of the residual.

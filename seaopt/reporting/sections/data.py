@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Literal
 
@@ -132,7 +132,7 @@ class Commands:
     fit: str = ""
     tune: str = ""
     certify: str = ""
-    plants: tuple[str, ...] = ("NAME",)  # the tables of the plants that are fitted
+    plants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # of those that are fitted: table to parts
 
     @property
     def sweep(self) -> str:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from seaopt.estimation import Fit
 from seaopt.estimation.result.findings import DerivedFigure, LogValues
+from seaopt.estimation.result.trials import spell_parameters, spell_parts
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.parameters import Parameter
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, list_notes
 from seaopt.units import unit_after
 
 RESOLVED = 2.0  # standard deviations by which a value differs from zero, to be proposed
-NAME = "NAME"  # of a plant, in the lines that add a part to it
+NAME, PARAMETERS = "NAME", "[parameters]"  # of a plant whose table is not known; and the place of what is freed
 DELAY_ROOM = 5.0  # times a delay that was found, up to which it may go
 MOST_PLACES = 3  # that a reason names
 EXPLAINED = (
@@ -239,28 +240,43 @@ def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:
         yield Reason(what=what, where=text, count=1 + len(named[MOST_PLACES:]))
 
 
-def _list_cures(fit: Fit, plants: Sequence[str]) -> Iterator[str]:
+def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Yield what to write for the likely cause that is named first, with the lines, place by place. What is not told
     from zero is not to be freed, nor how sharp friction is: a search for that takes long and ends nowhere. What comes
-    with a part comes with its line.
+    with a part comes with its line, beside the parts that the plant has. `plants`: the parts of each table.
     """
     causes = (each for each in fit.findings if each.kind == "cause" and (each.preferred or each.sticks))
     cause = next(causes, None)
     if cause is None:
         return
-    lines = [f"[plant.{NAME}]", "sticks = true"] if cause.sticks else list[str]()
-    added = {name: row.proposal.splitlines() for row in reversed(fit.hypotheses) for name in row.frees}
+    trials = {name: row for row in reversed(fit.hypotheses) for name in row.frees}
+    added: dict[str, None] = {}
+    places: dict[str, dict[str, None]] = {}
     for name in cause.preferred if cause.together is None else cause.together:
         value, std = cause.preferred[name]
-        if abs(value) > RESOLVED * std:
-            lines += added[name] if name in added and name not in fit.parameters else spell_cure(name, value)
-    places, place = dict[str, dict[str, None]](), ""
-    for line in lines:
-        place = line if line.startswith("[") else place
-        places.setdefault(place, {}).update({} if line == place else {line: None})
-    for place, rows in places.items():
-        for header in [place.replace(NAME, name) for name in plants] if NAME in place else [place]:
-            yield "\n".join([f"write under {header}, in place of a line of that name if there is one:", *rows])
+        if abs(value) <= RESOLVED * std:
+            continue
+        if name in trials and name not in fit.parameters:
+            added.update(dict.fromkeys(trials[name].parts))
+            place, rows = PARAMETERS, spell_parameters(trials[name].frees, trials[name].fixed)
+        else:
+            place, *rows = spell_cure(name, value) or [PARAMETERS]
+        places.setdefault(place, {}).update(dict.fromkeys(rows))
+    if not plants:
+        recipes = [experiment.plant.recipe for experiment in fit.experiments[:1]]
+        plants = {NAME: [part for recipe in recipes if recipe is not None for part in recipe.parts]}
+    for name, parts in plants.items():
+        rows = ["sticks = true"] if cause.sticks else []
+        rows += spell_parts((*parts, *added)) if added else []
+        if rows:
+            yield _say_place(f"[plant.{name}]", rows)
+    for place, lines in places.items():
+        if lines:
+            yield _say_place(place, lines)
+
+
+def _say_place(place: str, rows: Iterable[str]) -> str:
+    return "\n".join([f"write under {place}, in place of a line of that name if there is one:", *rows])
 
 
 def spell_cure(name: str, value: float) -> list[str]:
@@ -269,7 +285,7 @@ def spell_cure(name: str, value: float) -> list[str]:
     """
     *experiment, parameter = name.split(".")
     if not experiment:
-        return ["[parameters]", f"{parameter} = {{ value = {value:.4g}, free = true }}"]
+        return [PARAMETERS, f"{parameter} = {{ value = {value:.4g}, free = true }}"]
     if parameter == "delay_s" and value > 0.0:
         settings = f"value = {value:.4g}, free = true, max = {DELAY_ROOM * value:.2g}"
         return [f"[[experiment]] {experiment[0]}, beside its log", f"delay_s = {{ {settings} }}"]
