@@ -25,7 +25,7 @@ from seaopt.machine.replay import Replay, replay
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, find_refused, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Source, stand
-from seaopt.machine.ticks import Ticks, take_ticks
+from seaopt.machine.ticks import Gaps, Ticks, take_ticks
 from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
 from seaopt.robustness import check_ranges
@@ -67,6 +67,8 @@ class Acceptance(Result, Worded):
         Why there is no response, or none of a log.
     place : (str, float, str) or None
         Of a schedule its variable, where that stood, and its unit.
+    gaps : tuple of Gaps or None
+        Of each log, what it lacks.
     """
 
     controller: Controller
@@ -76,6 +78,7 @@ class Acceptance(Result, Worded):
     differences: Differences | None = None
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
     place: tuple[str, float, str] | None = None
+    gaps: tuple[Gaps | None, ...] = ()
     experiments: tuple[Log, ...] = ()
 
     @property
@@ -93,7 +96,8 @@ class Acceptance(Result, Worded):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of acceptance.json (schema seaopt/acceptance/1)."""
-        logs = [{"log": source} | to_content(row) for source, row in zip(self.sources, self.replays, strict=True)]
+        parts = zip(self.sources, self.replays, self.gaps, strict=True)
+        logs = [{"log": source} | to_content(row) | {"gaps": to_content(gaps)} for source, row, gaps in parts]
         content = {
             "schema": ACCEPTANCE_SCHEMA,
             "met": self.met,
@@ -222,13 +226,20 @@ def accept(
         for ticks, row in zip(rows, replays, strict=True)
         if row.met and row.ticks_per_row == 1 and ticks.rendered is None  # behind an outer loop is another plant
     )
-    result = Acceptance(controller=law, sources=sources, replays=tuple(replays), place=place, experiments=experiments)
+    result = Acceptance(
+        controller=law,
+        sources=sources,
+        replays=tuple(replays),
+        place=place,
+        gaps=tuple(ticks.gaps for ticks in rows),
+        experiments=experiments,
+    )
     if not result.replayed:
         told = any(not row.met and not row.undecided for row in replays)
         return replace(result, left_out={"response": OTHER_LAW if told else UNTOLD_LAW})
     rows = [
-        ticks.move_command(row.command_late) if row.command_late and row.ticks_per_row == 1 else ticks
-        for ticks, row in zip(rows, replays, strict=True)
+        _take_whole(controller, log, ticks, row, reference, at) if row.ticks_per_row == 1 else ticks
+        for log, ticks, row in zip(logs, rows, replays, strict=True)
     ]
     blocks, left_out = list[Blocks](), dict[str, str]()
     for ticks, row in zip(rows, replays, strict=True):
@@ -257,6 +268,13 @@ def accept(
     return replace(result, response=response, differences=differences, left_out=left_out)
 
 
+def _take_whole(source: Source, log: Log, ticks: Ticks, row: Replay, reference: str | None, at: float | None) -> Ticks:
+    """Return all ticks of a log whose longest stretch is of the law, each with the command that was made in it."""
+    if ticks.gaps is not None and ticks.rendered is None:
+        (ticks,) = list_ticks(source, [log], reference, at, whole=True)
+    return ticks.move_command(row.command_late) if row.command_late else ticks
+
+
 def _check_header(source: Source, log: Log, row: Replay, others: Mapping[str, Controller]) -> Replay:
     """Return a replay with the law that the log says it was taken under, where that is another and the replay does not
     tell why.
@@ -278,7 +296,13 @@ def _hash(source: Source) -> str:
 
 
 def list_ticks(
-    source: Source, logs: Sequence[Log], reference: str | None, at: float | None, *, before: bool = False
+    source: Source,
+    logs: Sequence[Log],
+    reference: str | None,
+    at: float | None,
+    *,
+    before: bool = False,
+    whole: bool = False,
 ) -> list[Ticks]:
     """Return the ticks of logs. Raises LogError: those of a schedule stand at different values, or at none of it."""
     over = source.over if isinstance(source, ScheduledController) else None
@@ -287,7 +311,7 @@ def list_ticks(
         if over is None:
             raise LogError(f"at = {at:g}: the law is not scheduled; leave it out")
     law = stand(source, at)
-    rows = [take_ticks(law, log, reference, over, at, before=before) for log in logs]
+    rows = [take_ticks(law, log, reference, over, at, before=before, whole=whole) for log in logs]
     if not isinstance(source, ScheduledController):
         return rows
     low, high = source.points[0], source.points[-1]
@@ -308,7 +332,7 @@ def list_ticks(
 def require_still(source: Source, ticks: Ticks) -> Ticks:
     """Return the ticks of a schedule whose variable stands still. Raises LogError: it moves."""
     assert isinstance(source, ScheduledController) and ticks.place is not None
-    low, high = float(np.min(ticks.place)), float(np.max(ticks.place))
+    low, high = float(np.nanmin(ticks.place)), float(np.nanmax(ticks.place))
     if high - low > SAME_PLACE * (source.points[-1] - source.points[0]):
         raise LogError(
             f"{ticks.source}: {source.over} moves from {low:.4g} to {high:.4g}{unit_after(source.unit)}, and the "

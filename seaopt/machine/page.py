@@ -16,6 +16,7 @@ from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, SHORT_BY, Judged, Measured, Response
+from seaopt.machine.ticks import Gaps
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -402,6 +403,9 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     if rows_of and read_gains(result.controller) is None:
         remarks += (NO_GAINS,)
     remarks += tuple(
+        _say_gaps(Path(source).name, gaps) for source, gaps in zip(result.sources, result.gaps, strict=True) if gaps
+    )
+    remarks += tuple(
         f"{Path(source).name} does not exclude that {', or that '.join(map(say_cause, row.possible))}."
         for source, row in zip(result.sources, result.replays, strict=True)
         if row.met and row.possible
@@ -428,6 +432,19 @@ def _describe_replay(result: Acceptance) -> list[Section]:
                 Section(title=f"Causes that were tried on {Path(source).name}", part="causes", tables=(table,))
             )
     return sections
+
+
+def _say_gaps(name: str, gaps: Gaps) -> str:
+    """Return what a log lacks, and what to do about it."""
+    lacks = [f"no row of {format_count(gaps.ticks, 'tick')}"] if gaps.ticks else []
+    lacks += [f"{format_count(gaps.rows, 'row')} with a number missing"] if gaps.rows else []
+    places = f"in {format_count(gaps.count, 'place')}, the first after {format_number(gaps.first_s, 3)} s"
+    return (
+        f"{name} has {join_words(lacks)} by its clock, {places}: the law is replayed on its longest stretch without, "
+        f"of {format_count(gaps.longest, 'tick')}, and each period that misses a row is left out of the response. Log "
+        "every tick; where none is lost and the stamps alone leap, leave the time column out of the log and state "
+        "[acceptance] rate_hz in the problem file."
+    )
 
 
 def summarise(result: Acceptance) -> list[KeyFigure]:

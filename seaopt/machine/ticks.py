@@ -8,7 +8,7 @@ from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from seaopt.control import Controller
 from seaopt.control.loops.outer_loop import OuterLoop
@@ -25,9 +25,22 @@ FEWEST_FLAT, FEWEST_VISITS, FLAT = 10, 3, 3  # readings at the edge of a range, 
 FEWEST = 50  # ticks that a replay takes at least
 
 
+@record
+class Gaps:
+    """What a log lacks."""
+
+    ticks: int  # that have no row, by its clock
+    rows: int  # with a number missing
+    count: int  # of places where either is
+    first_s: float  # from the log's start to the first
+    longest: int  # rows of the longest stretch without
+
+
 @record(eq=False)
 class Ticks:
-    """The longest stretch of a log without a gap or a missing number, a row per tick."""
+    """A log's longest stretch without a gap or a missing number, a row per tick; or all of it, where the rows that are
+    missing are no numbers.
+    """
 
     source: str
     rate_hz: float  # by the log's own clock
@@ -38,10 +51,17 @@ class Ticks:
     place: Float[np.ndarray, " n"] | None = None  # of a schedule, its variable
     rendered: dict[str, Float[np.ndarray, " n"]] | None = None  # parts of an outer loop, of which reference is the sum
     beside: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict[str, Any])  # outputs it does not read
-    left_out: int = 0  # rows of the log that are in no such stretch
+    left_out: int = 0  # rows of the log that are not in it
+    gaps: Gaps | None = None  # of the log; None where it has none
 
     def __len__(self) -> int:
         return self.command.size
+
+    @property
+    def complete(self) -> Bool[np.ndarray, " n"]:
+        """Which rows have all numbers."""
+        parts = (self.reference[:, None], self.command[:, None], self.measured, self.further)
+        return np.all(np.isfinite(np.column_stack(parts)), axis=1)
 
     def take(self, rows: Any, *, command: slice | None = None, measured: slice | None = None) -> Ticks:
         """Return some rows, a slice or numbers; with the command, or the readings, of other rows."""
@@ -76,7 +96,7 @@ class Ticks:
     @property
     def middle(self) -> float | None:
         """Where a schedule's variable is as a rule."""
-        return None if self.place is None else float(np.median(self.place))
+        return None if self.place is None else float(np.nanmedian(self.place))
 
     @property
     def quantum(self) -> float:
@@ -92,11 +112,13 @@ def take_ticks(
     at: float | None = None,
     *,
     before: bool = False,
+    whole: bool = False,
 ) -> Ticks:
     """Return the ticks of a log whose channels carry the names of the controller's signals, of the input that it
     commands, and of its reference. `over`: the variable of its schedule, which was `at` a value where the log does not
-    have it. `before`: the reference is a force, to which its outer loop without a stiffness adds the damping. Raises
-    LogError: a channel is missing, or no stretch is long enough.
+    have it. `before`: the reference is a force, to which its outer loop without a stiffness adds the damping.
+    `whole`: all of the log, in place of its longest stretch without a gap. Raises LogError: a channel is missing, or no
+    stretch is long enough.
     """
     command, names = controller.command, (*controller.signals, *controller.further)
     called = [reference] if reference is not None else [name for name in REFERENCES if name in log.signals]
@@ -126,15 +148,18 @@ def take_ticks(
     placed = over is not None and over in log.signals
     columns = [log[name] for name in (called[0], command.input, *names, *([over] if placed and over else []))]
     table = np.column_stack(columns)
-    rows = _find_longest(log, np.all(np.isfinite(table), axis=1))
+    has_all = np.all(np.isfinite(table), axis=1)
+    rows = _find_longest(log, has_all)
     if rows.stop - rows.start < FEWEST:
         raise LogError(
             f"{log.source}: {rows.stop - rows.start} rows in a row have all of {called[0]}, {command.input}, "
             f"{join_words(names)}; log at least {FEWEST} ticks without a gap, better some periods of the reference"
         )
-    table, count = table[rows], len(controller.signals)
-    if not np.any(np.ptp(table, axis=0)):
+    count, gaps = len(controller.signals), _find_gaps(log, has_all, rows)
+    whole = whole and gaps is not None
+    if not np.any(np.ptp(table[rows], axis=0)):
         raise LogError(f"{log.source}: nothing moves in it, which any law may have made; play a reference that moves")
+    table = _lay_out(log, np.where(has_all[:, None], table, np.nan)) if whole else table[rows]
     place = table[:, -1] if placed else None if over is None else np.full(len(table), at)
     further = 2 + count + len(controller.further)
     ticks = Ticks(
@@ -145,17 +170,49 @@ def take_ticks(
         measured=table[:, 2 : 2 + count],
         further=table[:, 2 + count : further],
         place=place,
-        beside=_take_beside(controller, log, rows),
-        left_out=len(log) - len(table),
+        beside=_take_beside(controller, log, has_all if whole else rows, whole),
+        left_out=0 if whole else len(log) - len(table),
+        gaps=gaps,
     )
     return ticks if around is None else _render(ticks, around, table[:, 2 + names.index(around.position)])
 
 
-def _take_beside(controller: Controller, log: Log, rows: slice) -> dict[str, Float[np.ndarray, " n"]]:
+def _take_beside(controller: Controller, log: Log, rows: Any, whole: bool) -> dict[str, Float[np.ndarray, " n"]]:
     """Return the outputs of the design plant that were logged without a gap, and that the law does not feed back."""
     outputs = {} if controller.design is None else controller.see(controller.design[0]).outputs
-    found = {name: log[name][rows] for name in outputs if name in log.signals and name not in controller.signals}
-    return {name: column for name, column in found.items() if np.all(np.isfinite(column))}
+    names = [name for name in outputs if name in log.signals and name not in controller.signals]
+    names = [name for name in names if np.all(np.isfinite(log[name][rows]))]
+    return {name: _lay_out(log, log[name][:, None])[:, 0] if whole else log[name][rows] for name in names}
+
+
+def _count_lost(log: Log) -> Int[np.ndarray, " n"]:
+    """Return how many ticks have no row, by a log's clock, ahead of each row; no more than it has rows."""
+    step = np.diff(log.time, prepend=log.time[0] - log.period)
+    lost = np.where(step > log.gap_s, np.maximum(np.round(step / log.period) - 1.0, 1.0), 0.0)
+    return np.minimum(lost, len(log)).astype(int)
+
+
+def _lay_out(log: Log, table: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "m k"]:
+    """Return the rows of a log where its clock has them, and no numbers between."""
+    at = np.arange(len(log)) + np.cumsum(_count_lost(log))
+    laid = np.full((at[-1] + 1, table.shape[1]), np.nan)
+    laid[at] = table
+    return laid
+
+
+def _find_gaps(log: Log, has_all: Bool[np.ndarray, " n"], longest: slice) -> Gaps | None:
+    """Return what a log lacks; None where it lacks nothing."""
+    lost = _count_lost(log)
+    starts = (lost > 0) | np.diff(~has_all, prepend=False) & ~has_all
+    if not np.any(starts):
+        return None
+    return Gaps(
+        ticks=int(np.sum(lost)),
+        rows=int(np.sum(~has_all)),
+        count=int(np.sum(starts)),
+        first_s=float(log.time[np.argmax(starts)] - log.time[0]),
+        longest=longest.stop - longest.start,
+    )
 
 
 def _render(ticks: Ticks, outer: OuterLoop, position: Float[np.ndarray, " n"]) -> Ticks:

@@ -63,14 +63,56 @@ def test_periods_in_which_the_gate_did_not_believe_a_reading_are_counted(compile
     assert says in terminal and says in page
 
 
-def test_periods_beyond_a_gap_are_counted(controller, bench, tmp_path):
+def lose(log, rows):
+    """Return a log without some of its rows."""
+    kept = np.delete(np.arange(len(log)), rows)
+    columns = {name: log[name][kept] for name in ("reference", "F1", "I")}
+    return so.Log.from_arrays(time=log.time[kept], source="bench", **columns)
+
+
+@pytest.mark.parametrize(("rows", "lost"), [([7200], 1), (range(7200, 7300), 1), ([999, 3500, 3700, 6100], 2)])
+def test_periods_with_a_gap_are_counted_and_all_others_used(controller, bench, rows, lost, tmp_path):
+    rows, whole = list(rows), bench.log(Machine(), REFERENCE)
+    terminal, page, record = read_everywhere(so.accept(controller, [lose(whole, rows)]), tmp_path)
+    (part,) = record["response"]["measured"]
+    assert part["left_out"] == {"limit": 0, "gate": 0, "gap": lost} and part["periods"] == 9 - lost
+    says = f"{lost} of them miss a row or a number"
+    assert says in terminal and says in page
+    gaps, says = record["replay"]["logs"][0]["gaps"], f"bench has no row of {len(rows)} tick"
+    assert (gaps["ticks"], gaps["rows"]) == (len(rows), 0)
+    assert says in terminal and says in page
+
+
+def test_periods_beside_gaps_say_what_they_say_without(controller, bench):
+    """The mean over the periods that are left, by an FFT of the log's own rows."""
     whole = bench.log(Machine(), REFERENCE)
-    kept = np.delete(np.arange(len(whole)), slice(7200, 7300))
-    columns = {name: whole[name][kept] for name in ("reference", "F1", "I")}
-    log = so.Log.from_arrays(time=whole.time[kept], source="bench", **columns)
-    terminal, page, record = read_everywhere(so.accept(controller, [log]), tmp_path)
-    assert record["response"]["measured"][0]["left_out"] == {"limit": 0, "gate": 0, "gap": 2}
-    assert "2 of them would lie beyond a gap" in terminal and "2 of them would lie beyond a gap" in page
+    result = so.accept(controller, [lose(whole, [2500, 5100, 5101, 8999])])
+    (part,) = result.response.measured
+    kept = [1, 3, 4, 6, 7, 9]
+    force, goal = (
+        np.fft.rfft(whole[name].reshape(10, PERIOD)[kept].mean(axis=0))[LINES] for name in ("F1", "reference")
+    )
+    assert part.periods == len(kept) and np.allclose(part.f, LINES)
+    assert np.allclose(part.tracking.value, force / goal, rtol=1e-9)
+
+
+def test_a_gap_of_a_period_and_more_begins_a_stretch(controller, bench):
+    result = so.accept(controller, [lose(bench.log(Machine(), REFERENCE), range(3300, 4800))])
+    (part,) = result.response.measured
+    assert part.periods >= 6 and part.left_out.gap >= 1 and result.met
+
+
+def test_a_log_with_a_gap_in_each_period_says_so_and_how_many(controller, bench, tmp_path):
+    rng = np.random.default_rng(1)
+    rows = np.unique(rng.integers(1, 9999, 100))
+    log = lose(bench.log(Machine(), REFERENCE), rows)
+    terminal, page, record = read_everywhere(
+        so.accept(controller, [log], played=Played(period_s=1.0, lasts_s=12.0)), tmp_path
+    )
+    assert record["response"] is None and "whole periods of 1 s" in record["left_out"]["bench"]
+    assert "shorter than" not in record["left_out"]["bench"] and "9 of them miss a row" in record["left_out"]["bench"]
+    assert record["replay"]["logs"][0]["gaps"]["ticks"] == rows.size
+    assert f"no row of {rows.size} ticks" in terminal and f"no row of {rows.size} ticks" in page
 
 
 def test_stability_is_shown_with_what_it_is_and_its_limit(controller, bench, tmp_path):

@@ -72,7 +72,7 @@ def compare(
     reach = np.max(np.abs(drawn - model), axis=0, initial=0.0)
     left = np.abs(response - model) - comparison.radius(1.0 - confidence) - reach
     share = left / np.abs(model)
-    flat = [*_list_clipped(controller, logs)]
+    flat = [*_list_clipped(controller, [ticks.take(np.flatnonzero(ticks.complete)) for ticks in logs])]
     at = {name: each.value for name, each in nominal.items()}
     spread = take_spread(draws, at)
     found = [*flat, *explain(comparison, beside, model, spread)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -45,7 +46,7 @@ class LeftOut:
 
     limit: int = 0  # the command was at its limit
     gate: int = 0  # a reading was not believed, and the one before it stood in
-    gap: int = 0  # beyond a gap, or with a number missing
+    gap: int = 0  # a row or a number is missing, or they lie beyond a gap
 
     @property
     def total(self) -> int:
@@ -94,8 +95,8 @@ def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
     if reference.size < 2 * SHORTEST:
         return None
     moving = np.diff(reference)  # in which a bias that fades in is small
-    moving -= np.mean(moving)
-    size, n = float(np.ptp(reference)), moving.size
+    moving = np.nan_to_num(moving - np.nanmean(moving))
+    size, n = _span(reference), moving.size
     spectrum = np.abs(np.fft.rfft(moving, 2 * n)) ** 2
     total = np.fft.irfft(spectrum)[: n // 2 + 3]  # differences are one fewer: half of the rows is a lag inside
     if total[0] <= (STEADY * size) ** 2 * n:
@@ -120,12 +121,31 @@ def _find_repeated(reference: Float[np.ndarray, " n"], lag: int, size: float) ->
     return np.abs(reference[lag:] - reference[:-lag]) <= SAME * size
 
 
+def _span(reference: Float[np.ndarray, " n"]) -> float:
+    """Return the range of the rows that are there."""
+    return float(np.nanmax(reference) - np.nanmin(reference))
+
+
+def _find_short(missing: Bool[np.ndarray, " n"], most: int) -> Bool[np.ndarray, " n"]:
+    """Tell which of the missing rows are in gaps of no more than so many rows."""
+    short = np.zeros(missing.size, dtype=bool)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(int))).reshape(-1, 2)
+    for start, stop in edges[np.diff(edges, axis=1)[:, 0] <= most].tolist():
+        short[start:stop] = True
+    return short
+
+
 def _find_stretches(reference: Float[np.ndarray, " n"], period: int) -> list[tuple[int, int]]:
-    """Return where each stretch begins in which periods repeat, and how many are whole."""
-    size, stretches = float(np.ptp(reference)), list[tuple[int, int]]()
-    same = np.concatenate([[False], _find_repeated(reference, period, size), [False]])
+    """Return where each stretch begins in which periods repeat, and how many there are. What is missing for less than
+    half of a period repeats as what is around it does.
+    """
+    size, stretches, missing = _span(reference), list[tuple[int, int]](), np.isnan(reference)
+    short = _find_short(missing, period // 2)
+    there = ~(missing & ~short)
+    same = _find_repeated(reference, period, size) | short[period:] | short[:-period]
+    same = np.concatenate([[False], same & there[period:] & there[:-period], [False]])
     for first, last in np.flatnonzero(np.diff(same.astype(int))).reshape(-1, 2).tolist():
-        if last - first >= period and np.ptp(reference[first : first + period]) > SAME * size:
+        if last - first >= period and _span(reference[first : first + period]) > SAME * size:
             stretches.append((first, (last - first) // period + 1))
     return stretches
 
@@ -137,7 +157,22 @@ def shorten(ticks: Ticks) -> Ticks:
     stretches = _find_stretches(ticks.reference, period)
     least = TRANSIENT + (1 if len(stretches) > 1 else 2)
     rows = [np.arange(first, first + period * min(least, whole)) for first, whole in stretches]
-    return ticks.take(np.concatenate(rows))
+    reference = _fill(ticks.reference, period, stretches)
+    return replace(ticks, reference=reference).take(np.concatenate(rows))
+
+
+def _fill(
+    reference: Float[np.ndarray, " n"], period: int, stretches: Sequence[tuple[int, int]]
+) -> Float[np.ndarray, " n"]:
+    """Return a reference with the rows that are missing as they are in the other periods of their stretch."""
+    filled, n = reference.copy(), np.arange(reference.size)
+    for first, whole in stretches:
+        part = filled[first : first + period * whole].reshape(whole, period)  # a view
+        for row in part:
+            for other in part:
+                np.copyto(row, other, where=np.isnan(row))
+    there = np.isfinite(filled)
+    return np.interp(n, n[there], filled[there])
 
 
 def say_left_out(left_out: LeftOut) -> list[str]:
@@ -145,7 +180,7 @@ def say_left_out(left_out: LeftOut) -> list[str]:
     counts = (
         (left_out.limit, "in {} of them the command is at its limit: lower the amplitude, or allow a larger limit"),
         (left_out.gate, "in {} of them the gate did not believe a reading: look at its range and its largest step"),
-        (left_out.gap, "{} of them would lie beyond a gap, or have a number missing: log every tick"),
+        (left_out.gap, "{} of them miss a row or a number, or lie beyond such a gap: log every tick"),
     )
     return [text.format(count) for count, text in counts if count]
 
@@ -173,6 +208,9 @@ def find_refused(controller: Controller, ticks: Ticks) -> Bool[np.ndarray, " n"]
         return refused
     read, encoders = ticks.measured[:, 0], [ticks.further[:, controller.further.index(name)] for name in gate.reads]
     for k, row in enumerate(zip(read.tolist(), *(each.tolist() for each in encoders), strict=True)):
+        if not all(map(math.isfinite, row)):  # a gap: what was held before it is not known
+            state = GateState()
+            continue
         _, state = gate.screen(state, row[0], row[1:])
         refused[k] = state.held > 0
     return refused
@@ -199,9 +237,13 @@ def cut_periods(
     at_limit = np.abs(ticks.command) >= AT_LIMIT * (controller.command_limit or np.inf)
     limited = [bool(np.any(at_limit[first : first + period])) for first, _ in starts]
     gated = [refused is not None and bool(np.any(refused[first : first + period])) for first, _ in starts]
-    free = [pair for pair, *off in zip(starts, limited, gated, strict=True) if not any(off)]
-    both = sum(map(all, zip(limited, gated, strict=True)))
-    left_out = LeftOut(limit=sum(limited), gate=sum(gated) - both, gap=ticks.left_out // period)
+    complete = ticks.complete
+    cut = [not bool(np.all(complete[first : first + period])) for first, _ in starts]
+    free = [pair for pair, *off in zip(starts, limited, gated, cut, strict=True) if not any(off)]
+    limit = sum(by and not gap for by, gap in zip(limited, cut, strict=True))
+    gate = sum(by and not any(off) for by, *off in zip(gated, limited, cut, strict=True))
+    beyond = (int(np.sum(~complete & ~_find_short(~complete, period // 2))) + ticks.left_out) // period
+    left_out = LeftOut(limit=limit, gate=gate, gap=sum(cut) + beyond)
     if len(free) < 2:
         if (away := say_runaway(controller, ticks)) is not None:
             raise LogError(f"{ticks.source}: {away}")

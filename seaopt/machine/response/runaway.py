@@ -26,6 +26,7 @@ class Runaway:
 
 def find_runaway(controller: Controller, ticks: Ticks) -> Runaway | None:
     """Return how a log ends whose loop ran away; None where it did not."""
+    ticks = ticks.take(np.flatnonzero(ticks.complete))
     error = np.abs(ticks.measured[:, 0] - ticks.reference)
     swing = float(np.ptp(ticks.reference))
     before, most = float(np.max(error[: error.size // 2])), float(np.max(error))
@@ -53,7 +54,7 @@ def say_runaway(controller: Controller, ticks: Ticks) -> str | None:
     lasts, said = len(ticks) / ticks.rate_hz, list[str]()
     if found.reading is not None:
         unit, name = unit_after(command.reference_unit), controller.signals[0]
-        swing = f"{float(np.ptp(ticks.reference)):.3g}{unit}"
+        swing = f"{float(np.ptp(ticks.reference[ticks.complete])):.3g}{unit}"
         said.append(f"{name} ran to {found.reading:.3g}{unit} under a reference that swings by {swing}")
     if found.limited:
         limit = f"{controller.command_limit:.3g}{unit_after(command.unit)}"
