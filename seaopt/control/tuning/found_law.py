@@ -27,7 +27,7 @@ from seaopt.control.tuning.solution import (
 )
 from seaopt.errors import SeaoptError
 from seaopt.plants.friction import list_fall_parameters
-from seaopt.progress import Progress, divide, ignore
+from seaopt.progress import Progress, divide
 from seaopt.records import record
 
 SOLUTION, BANDWIDTHS, EASING = 1.0, 2.0, 2.0  # of the time of a tune that is not possible as asked
@@ -112,7 +112,7 @@ def meet_outer(
     what misses least. Damping that is critical is another around each law: where that takes one beyond a limit, the law
     follows it.
     """
-    tried: list[FoundT] = []
+    tried, rounds = list[FoundT](), divide(progress, *[1.0] * OUTER_ROUNDS)
     for number in range(OUTER_ROUNDS + 1):
         law = describe(found)
         try:
@@ -130,8 +130,8 @@ def meet_outer(
         tried.append(found)
         if not found.missed or number == OUTER_ROUNDS:
             break
-        progress("tuning with the outer loop", number / OUTER_ROUNDS)
-        found = found.follow(ignore, first=not number)
+        rounds[number]("tuning with the outer loop", 0.0)
+        found = found.follow(rounds[number], first=not number)
     return min(tried, key=lambda each: each.missed) if tried else found
 
 

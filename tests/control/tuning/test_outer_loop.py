@@ -399,6 +399,21 @@ def test_what_misses_its_limits_least_is_taken(missed, taken):
     assert found.outer == taken
 
 
+def test_what_follows_an_outer_loop_tells_how_far_it_is():
+    class Telling(Steps):
+        def enclose(self, outer, _):
+            return Telling(self.misses, outer)
+
+        def follow(self, progress, *, first):
+            progress("half of it", 0.5)
+            return self
+
+    calls, heard = itertools.count(), []
+    meet_outer(Telling([1.3, 1.1, 0.0]), lambda one: one, lambda _: next(calls), lambda *note: heard.append(note))
+    assert [note for note, _ in heard] == ["tuning with the outer loop", "half of it"] * 2
+    assert [share for _, share in heard] == pytest.approx([0.0, 0.5 / 6, 1 / 6, 1.5 / 6])
+
+
 @pytest.mark.slow
 def test_a_schedule_that_misses_its_limits_misses_them_least_of_what_was_tried():
     """With a damping that gets less each time it is asked for, of which the first is already too little."""
