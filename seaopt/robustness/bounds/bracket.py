@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from seaopt.codec import OrInfinite
 from seaopt.control import Controller
-from seaopt.control.loops.loop import STABLE
+from seaopt.control.loops.loop import GROWING, STABLE
 from seaopt.control.running.fed_back import close_terms
 from seaopt.errors import ControlError
 from seaopt.options import check_options, option
@@ -61,8 +61,8 @@ class Budget:
         "Done when the bounds are within this fraction of the largest Ms and Mt measured.", default=0.01, above=0.0
     )
     boxes: int = option("Boxes after which to stop, for each plant.", default=1000, above=0)
-    seconds: float = option(
-        "The same in time, checked between blocks of boxes; the bounds then depend on the machine.",
+    seconds: float | None = option(
+        "The same in time, checked between blocks of boxes; the bounds then depend on the machine. None: boxes alone.",
         default=60.0,
         unit="s",
         above=0.0,
@@ -142,6 +142,7 @@ class _BranchAndBound:
     upper: Float[np.ndarray, " 2"]
     severity: float
     stable: bool = True
+    marginal: float | None = None  # where a law that changes has a loop that is stable but for rounding
     count: int = 0
     parameters: dict[str, float] = field(default_factory=dict[str, float])
 
@@ -185,7 +186,7 @@ def bracket(
     (True, True)
     """
     budget = budget or Budget()
-    end = time.perf_counter() + budget.seconds
+    end = np.inf if budget.seconds is None else time.perf_counter() + budget.seconds
     peaks = np.zeros(2) if worst is None else np.array([worst.ms, worst.mt])
     try:
         controller = close_terms(controller, plant)
@@ -222,7 +223,9 @@ def _conclude(search: _BranchAndBound) -> Bracket:
     upper = np.maximum(bound, search.lower)
     bounded = bool(np.all(np.isfinite(upper)) and search.stable) and not void
     lower, upper = search.lower.tolist(), upper.tolist() if bounded else [np.inf, np.inf]
-    reason = "a plant of the set is worse than the bound, which is therefore void; the model was not enclosed"
+    reason = "a plant of the set is worse than the bound, which is therefore void; the model was not enclosed" * void
+    if not (void or bounded or search.marginal is None) and np.all(np.isfinite(search.lower)):
+        reason = f"at {search.marginal:.9g} the loop has a pole that is 1 to rounding"
     return Bracket(
         ms_lower=lower[0],
         ms_upper=upper[0],
@@ -231,7 +234,7 @@ def _conclude(search: _BranchAndBound) -> Bracket:
         bounded_stable=bounded,
         boxes=search.count,
         parameters=search.parameters,
-        left_out=reason if void else "",
+        left_out=reason,
     )
 
 
@@ -415,6 +418,11 @@ def _measure(search: _BranchAndBound, points: Points) -> Bool[np.ndarray, " c"]:
     values = within.evaluate(points) | fixed
     figures = _measure_draws(search, values)
     inside = within.contains(points)
+    if search.scheduled is not None:  # where a gain starts at zero a pole comes out of 1: that refutes nothing
+        near = (figures.spectral_radius >= STABLE) & (figures.spectral_radius <= GROWING) & inside
+        if np.any(near):
+            search.marginal = float(values[search.scheduled.coordinate][int(np.argmax(near))])
+        inside = inside & ~near
     for k, peaks in enumerate((figures.ms, figures.mt)):
         search.lower[k] = max(search.lower[k], np.max(peaks[inside], initial=0.0))
     severity = np.where(inside, severities(search.controller, figures), 0.0)

@@ -20,9 +20,11 @@ from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Budget, bracket
 from seaopt.robustness.bounds.scheduled_law import ScheduledLaw
-from seaopt.robustness.uncertainty.draws import combine_uncertainty
+from seaopt.robustness.uncertainty.batch import batch_figures
+from seaopt.robustness.uncertainty.draws import Column, combine_uncertainty
+from seaopt.robustness.uncertainty.severity import find_failures, limits
 
-BUDGET = Budget(tolerance=0.02, boxes=400, seconds=20.0)
+BUDGET = Budget(tolerance=0.02, boxes=400, seconds=None)
 PLACE = "schedule_place"  # a parameter, of a plant without the variable
 
 
@@ -40,6 +42,10 @@ class StretchBound:
         No Ms is larger; infinite where nothing is shown.
     reason : str
         Why nothing is shown; empty where it is.
+    broken_at : float, optional
+        A value whose loop was measured to be unstable, or beyond the limit on Ms or Mt.
+    broken : str
+        What it breaks; empty where none was found.
     """
 
     plant: str
@@ -47,6 +53,8 @@ class StretchBound:
     high: float
     ms: OrInfinite
     reason: str
+    broken_at: float | None = None
+    broken: str = ""
 
     @property
     def shown(self) -> bool:
@@ -75,5 +83,32 @@ def bound_stretch(
     unknown = combine_uncertainty(values, ParameterSet(), {place: (low, high)}, {name: plant})
     unknown = replace(unknown, names=(), covariance=np.zeros((0, 0)))
     bounded = bracket(middle, plant, unknown, budget=BUDGET, scheduled=law)
-    reason = "" if bounded.bounded_stable else bounded.left_out or f"no bound in {bounded.boxes} boxes"
-    return StretchBound(plant=name, low=low, high=high, ms=np.inf if reason else bounded.ms_upper, reason=reason)
+    worst = {name: np.array([value]) for name, value in bounded.parameters.items()}
+    broken, reason = _name_broken(law, unknown.nominal, worst) if worst else "", ""
+    if not bounded.bounded_stable and not np.isfinite(bounded.ms_lower):
+        reason = f"at {table.over} = {bounded.parameters[place]:.6g} {broken}"
+    elif not bounded.bounded_stable:
+        ended = ", with which the search ends" * (bounded.boxes >= BUDGET.boxes)
+        reason = ", ".join(filter(None, (f"no bound in {bounded.boxes} boxes{ended}", bounded.left_out)))
+    return StretchBound(
+        plant=name,
+        low=low,
+        high=high,
+        ms=np.inf if reason else bounded.ms_upper,
+        reason=reason,
+        broken_at=bounded.parameters[place] if broken else None,
+        broken=broken,
+    )
+
+
+def _name_broken(law: ScheduledLaw, nominal: ParameterSet, values: dict[str, Column]) -> str:
+    """Return what the loop that stands at values breaks; empty where it keeps its limits."""
+    controller = law.at(float(values[law.coordinate][0]))
+    figures = batch_figures(controller, law.plant, nominal, values)
+    unstable, ms, mt = find_failures(controller, figures)[:, 0]
+    if unstable:
+        return "the loop is unstable"
+    ms_limit, mt_limit = limits(controller)
+    texts = [f"Ms is {figures.ms[0]:.5g}, above {ms_limit:g}" * bool(ms)]
+    texts += [f"Mt is {figures.mt[0]:.5g}, above {mt_limit:g}" * bool(mt)]
+    return " and ".join(filter(None, texts))

@@ -26,7 +26,7 @@ import numpy as np
 
 from seaopt.control import ScheduledController
 from seaopt.control.running.fed_back import LaterTerms, feeds_back, split_states
-from seaopt.control.scheduling.scheduled_controller import place_variable
+from seaopt.control.scheduling.scheduled_controller import RESERVE_BETWEEN, place_variable
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import join_words
 from seaopt.parameters import ParameterSet
@@ -45,7 +45,7 @@ from seaopt.units import unit_after
 if TYPE_CHECKING:
     from seaopt.robustness.certificate.certificate import Certificate
 
-MOTION_RATE = "min_motion_rate"
+BETWEEN, MOTION_RATE = "limits_between_points", "min_motion_rate"
 TERMS_CHANGE = "what is compensated changes with a state of the plant on the stretch"
 BOUND, SWEEP = 0.2, 5.0  # seconds that a stretch, and the sweeps of a plant, take as a rule
 
@@ -57,7 +57,8 @@ def measure_stretches(survey: Survey, progress: Progress) -> Evidence:
     shared = Shared((schedule, dict(cases.models)))
     bounds = map_ordered(partial(_bound_plants, shared, cases.unknown.nominal), pairs, survey.executor)
     stretches = tuple(bound for _ in count_off(pairs, "stretch", progress) for bound in next(bounds))
-    return Evidence(requirements=_require_limits_between(schedule), fields={"stretches": stretches})
+    rows = [*_require_limits_between(schedule), *_refute_limits_between(schedule, stretches)]
+    return Evidence(requirements=rows, fields={"stretches": stretches})
 
 
 def join_places(survey: Survey, _: Progress) -> Evidence:
@@ -139,7 +140,7 @@ def _require_limits_between(schedule: ScheduledController) -> list[Requirement]:
     """Return that the design plant's limits hold between the points, 0.9 of the bandwidth asked among them."""
     return [
         require_at_most(
-            "limits_between_points",
+            BETWEEN,
             float(len(place.broken)),
             0.0,
             place=(schedule.over, place.value),
@@ -147,6 +148,23 @@ def _require_limits_between(schedule: ScheduledController) -> list[Requirement]:
             remedy=schedule.remedy if place.broken else "",
         )
         for place in schedule.between
+    ]
+
+
+def _refute_limits_between(schedule: ScheduledController, stretches: Sequence[StretchBound]) -> list[Requirement]:
+    """Return a requirement for each stretch on which a loop was found that breaks a limit."""
+    return [
+        require_at_most(
+            BETWEEN,
+            1.0,
+            0.0,
+            plant=bound.plant,
+            place=(schedule.over, bound.broken_at),
+            text=bound.broken,
+            remedy=f"add a point there, or tune with more room: reserve = {RESERVE_BETWEEN:g}",
+        )
+        for bound in stretches
+        if bound.broken_at is not None
     ]
 
 

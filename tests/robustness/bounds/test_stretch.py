@@ -10,6 +10,7 @@ import seaopt as so
 from seaopt.control import CompensateGravity, Compensation, ScheduledController, compensate_schedule, tune_schedule
 from seaopt.control.loops.compensation.ripple_term import RippleTerm
 from seaopt.control.running.fed_back import LaterTerms, close_whole, split_states
+from seaopt.robustness.bounds import stretch
 from seaopt.robustness.bounds.stretch import bound_stretch
 from tests.control.tuning.test_outer_loop import (
     ASKED,
@@ -18,10 +19,10 @@ from tests.control.tuning.test_outer_loop import (
     OF_KNEE,
     VALUES,
     close_by_hand,
-    find_peak,
     give_outer,
     move_knee,
 )
+from tests.hand_loops import find_peaks
 from tests.schedules import read_knee, tune_knee
 
 
@@ -75,7 +76,7 @@ def test_with_its_outer_loop_no_loop_has_more_than_its_bound():
         v = {name: VALUES[name].value for name in VALUES} | {"k_s": float(stiffness)}
         law = schedule.table.law(float(stiffness))
         hand = close_by_hand(law, move_knee(v), middle.signals, middle.command.per_effort, ASKED, 1.0)
-        found.append(find_peak(hand, lambda s: s))
+        found.extend(find_peaks(hand, lambda s: s))
     bound = bound_stretch("knee", middle, schedule.table, moved, VALUES.update(k_s=300.0), *points)
     alone = bound_stretch("knee", replace(middle, outer=None), schedule.table, KNEE, VALUES.update(k_s=300.0), *points)
     assert bound.shown and max(found) <= bound.ms * (1 + 1e-6) and bound.ms <= 1.03 * max(found)
@@ -116,11 +117,37 @@ def test_a_ripple_that_is_compensated_is_left_out_as_at_the_points():
     assert bounds[0].shown and bounds[0] == bounds[1]
 
 
-def test_a_law_that_changes_too_much_on_a_stretch_is_not_said_to_be_stable():
+def test_a_loop_that_is_unstable_on_a_stretch_is_named_with_its_value():
     schedule, (stand, _, values) = tune_knee(), read_knee()
     table = schedule.table
     gains = {name: row.copy() for name, row in table.gains.items()}
     gains["k_p"][1] *= 40.0  # far beyond what the delay allows
     wild = replace(table, gains=gains)
     bound = bound_stretch("stand", schedule.at(0.2), wild, stand, values.update(phi=0.2), 0.0, 0.4)
-    assert not bound.shown and math.isinf(bound.ms) and "no bound" in bound.reason
+    assert not bound.shown and math.isinf(bound.ms) and bound.broken == "the loop is unstable"
+    assert bound.reason == f"at phi = {bound.broken_at:.6g} the loop is unstable" and 0.0 < bound.broken_at <= 0.4
+    frozen = replace(schedule.at(0.2), law=wild.law(bound.broken_at))
+    assert not frozen.close(stand, values.update(phi=bound.broken_at)).figures().stable
+
+
+def test_a_loop_beyond_the_limit_on_ms_is_named_with_its_value():
+    """The proof that it is stable stands."""
+    schedule, (stand, _, values) = tune_knee(), read_knee()
+    least = min(schedule.at(s).close(stand, values.update(phi=s)).figures().ms for s in (0.0, 0.05, 0.1))
+    strict = replace(schedule.at(0.05), spec=replace(schedule.spec, max_sensitivity=least - 0.01))
+    bound = bound_stretch("stand", strict, schedule.table, stand, values.update(phi=0.05), 0.0, 0.1)
+    found = schedule.at(bound.broken_at).close(stand, values.update(phi=bound.broken_at)).figures()
+    assert bound.shown and bound.broken.startswith(f"Ms is {found.ms:.5g}, above {least - 0.01:g}")
+
+
+def test_a_pole_that_comes_out_of_one_as_a_gain_starts_refutes_nothing(monkeypatch):
+    """An integral that is zero at the first point: beside it the pole is within rounding of 1, and nothing grows."""
+    monkeypatch.setattr(stretch, "BUDGET", replace(stretch.BUDGET, boxes=130))
+    plant, values, points = so.plants.high_impedance(), so.plants.thor(), [2e5, 3e6]
+    spec = so.ControllerSpec(bandwidth_hz=25, structure="pid_dob", max_sensitivity=1.8, max_noise_gain=60)
+    schedule = tune_schedule(plant, values, spec, "k", points)
+    bound = bound_stretch("it", schedule.at(1.6e6), schedule.table, plant, values.update(k=1.6e6), *points)
+    beside = schedule.at(points[0] + 0.5).close(plant, values.update(k=points[0] + 0.5))
+    assert 1.0 - 1e-11 < np.max(np.abs(beside.eigenvalues())) < 1.0
+    assert not bound.shown and "1 to rounding" in bound.reason and "boxes, with which the search ends" in bound.reason
+    assert "unstable" not in bound.broken
