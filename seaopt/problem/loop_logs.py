@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from seaopt.errors import LogError
-from seaopt.logs import Column, Log, contents, read_log
+from seaopt.logs import Column, Log, contents, read_log, read_table
 from seaopt.logs.formats import Field
 from seaopt.logs.quality.clock import JITTER_LIMIT, assess_clock, shorten_rate, split_at_gaps
 from seaopt.logs.reading.selection import ClockError
 from seaopt.problem.bench_tables import ExperimentTable
 from seaopt.problem.columns import make_column
 from seaopt.problem.problem import Problem
-from seaopt.signals import REFERENCE, REFERENCES
+from seaopt.signals import REFERENCE, REFERENCES, Table, VectorN
 from seaopt.units import bare_name
 
 MOST_NAMES = 20  # in a message
+SAME_STAMP = 1e-6  # of a period, by which rows of one stamp are set apart
+OFF_RATE = 5e-3  # of the rows: as far as a clock is off
 LONG_STEP = 3.0  # periods of a step that no jitter makes of one, of ticks that are stamped late
 
 
@@ -62,13 +67,13 @@ def _read_ticks(path: Path, time: Column | None, channels: Mapping[str, Column],
     stamps them unevenly.
     """
     try:
+        if rate_hz is not None:
+            return _number_rows(read_table(path, time=time, channels=channels), rate_hz)
         log = read_log(path, time=time, channels=channels)
     except ClockError as error:
         if rate_hz is not None and time is None:
             return read_log(path, channels=channels, rate_hz=rate_hz)
         raise LogError(f"{error}; in the problem file: [acceptance] time = COLUMN, or rate_hz = RATE") from error
-    if rate_hz is not None:
-        return log.restamp(rate_hz=rate_hz)
     clock = assess_clock(log.time, log.source)
     if clock.jitter_max > JITTER_LIMIT * clock.period:
         raise LogError(
@@ -77,6 +82,33 @@ def _read_ticks(path: Path, time: Column | None, channels: Mapping[str, Column],
             f"{_advise_rate(log)}"
         )
     return log
+
+
+def _number_rows(table: Table, rate_hz: float) -> Log:
+    """Return a log whose rows are ticks in the order in which they were written, whenever each was stamped, with gaps
+    where the stamps tell them. Raises LogError: the stamps are of another rate.
+    """
+    rows, signals = np.arange(table.time.size), dict(table.signals)
+    stamps = np.sort(table.time[np.isfinite(table.time)])
+
+    def make_log(time: VectorN, *notes: str) -> Log:
+        return Log(time=time, signals=signals, source=table.source, notes=(*table.notes, *notes), law=table.law)
+
+    if stamps.size == rows.size:
+        with suppress(LogError):
+            return make_log(stamps + SAME_STAMP / rate_hz * rows).restamp(rate_hz=rate_hz)
+    lasts = float(stamps[-1] - stamps[0]) if stamps.size > 1 else 0.0
+    if abs(lasts * rate_hz - (rows.size - 1)) > OFF_RATE * rows.size:
+        mean = f", {(rows.size - 1) / lasts:.6g} Hz on average" if lasts else ""
+        raise LogError(
+            f"{table.source}: rate_hz = {rate_hz:g} is not the rate of its rows, {rows.size} in {lasts:.6g} s{mean}; "
+            "correct it, or where no row is missing leave the time column out: each row is a tick then"
+        )
+    return make_log(
+        rows / rate_hz,
+        f"each row is a tick of {rate_hz:g} Hz, in the order in which they were written; by such stamps a row that is "
+        "missing cannot be told",
+    )
 
 
 def _advise_rate(log: Log) -> str:

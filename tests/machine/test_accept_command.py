@@ -151,6 +151,41 @@ def test_no_length_is_advised_from_a_bring_up_of_another_law(folder, accept, tmp
     assert ("does not repeat" in done) is again
 
 
+@pytest.mark.parametrize("stamped", ["jitter", "bursts", "repeats", "missing", "wrong rate"])
+def test_with_a_rate_rows_are_ticks_in_the_order_in_which_they_were_written(folder, stamped, tmp_path):
+    """Stamps that run backwards or repeat refuse nothing; what they cannot tell is said."""
+    from typer.testing import CliRunner
+
+    log, rng = so.read_log(folder / "good.csv"), np.random.default_rng(2)
+    n = np.arange(len(log))
+    stamps = {
+        "jitter": log.time + 3e-4 * rng.normal(size=n.size),  # runs backwards now and then
+        "bursts": 40e-3 * (n // 40) + 20e-6 * (n % 40),
+        "repeats": np.floor(n / 2.0) * 2e-3,
+        "missing": np.where(n == 500, np.nan, log.time),
+        "wrong rate": log.time * 1.1,
+    }[stamped]
+    header, *rows = (folder / "good.csv").read_text().splitlines()
+    at = header.split(",").index("time [s]")
+    cells = [row.split(",") for row in rows]
+    kept = np.delete(n, slice(5000, 5060)) if stamped == "jitter" else n
+    written = [",".join([*cells[k][:at], f"{stamps[k]:.6f}", *cells[k][at + 1 :]]) for k in kept]
+    (tmp_path / "log.csv").write_text("\n".join([header, *written]) + "\n")
+    (folder / "ticks.toml").write_text(PROBLEM + "[acceptance]\nrate_hz = 1000\n")
+    arguments = ["accept", str(folder / "ticks.toml"), str(tmp_path / "log.csv"), "-o", str(folder / "out")]
+    done = CliRunner().invoke(app, arguments)
+    if stamped == "wrong rate":
+        assert done.exit_code != 0 and "is not the rate of its rows" in str(done.exception)
+        return
+    assert done.exit_code == 0, (done.output, done.exception)
+    (row,) = json.loads((folder / "out" / "acceptance.json").read_text())["replay"]["logs"]
+    if stamped == "jitter":
+        assert row["gaps"]["ticks"] == 60 and row["ticks"] == 5000
+    else:
+        told = "a row that is missing cannot be told" in " ".join(done.output.split())
+        assert row["gaps"] is None and row["ticks"] == n.size and told >= (stamped == "missing")
+
+
 def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
     done = accept(folder / "good.csv", folder / "half.csv")
     assert done.exit_code == 1 and "I is 0.5 times what it should be" in done.output
