@@ -202,13 +202,13 @@ def simulate(controller: so.Controller, reference: np.ndarray) -> Any:
 
 
 def run_schedule() -> dict[str, Any]:
-    """Return gains, the bound on their change and commands of a schedule, in Python and in C."""
+    """Return gains and commands of a schedule."""
     problem = so.read_problem(ROOT / "problems" / "lever_knee.toml")
     spec = so.ControllerSpec(measured="tau", bandwidth_hz=30, max_sensitivity=1.6, reserve=0.03, current_limit_A=5.0)
     schedule: ScheduledController = tune_schedule(
         problem.plants["stand"], problem.parameters, spec, "phi", (0.0, 0.4, 0.65), {"swing": problem.plants["swing"]}
     )
-    table, f = schedule.table, np.geomspace(0.1, 400.0, 12)
+    table = schedule.table
     places = np.linspace(-0.05, 0.7, PLACES)
     law = schedule.runnable()
     references, readings = make_signals(40.0, 2, 0)
@@ -218,10 +218,8 @@ def run_schedule() -> dict[str, Any]:
         if k == RESET:
             state = law.reset(place=float(readings[k, 1]))
         commands[k], state = law.step(state, float(references[k]), *map(float, readings[k]))
-    ends = zip(table.points[:-1], table.points[1:], strict=True)
     return {
         "gains": [table.interpolate(float(place)) for place in places],
-        "change": [table.bound_change(float(low), float(high), f) for low, high in ends],
         "commands": commands[::KEPT], "total": float(np.sum(np.abs(commands))),
     }  # fmt: skip
 

@@ -148,6 +148,15 @@ class ScheduledController(Result, Worded):
         return list(zip(self.points, self.controllers, strict=True))
 
     @property
+    def plants_at_points(self) -> tuple[str, ...]:
+        """The plants on which it is judged at the points alone, and not between them: draws, witnesses, responses."""
+        if not self.between:
+            return ()
+        judged = self.at(self.between[0].value).robust_to
+        named = dict.fromkeys(name for controller in self.controllers for name in controller.robust_to)
+        return tuple(name for name in named if name not in judged)
+
+    @property
     def remedy(self) -> str:
         """What to change where a limit is broken; empty where none is."""
         for point, controller in self._pairs:

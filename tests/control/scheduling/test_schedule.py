@@ -15,6 +15,7 @@ from seaopt.control.scheduling.scheduled_controller import list_inner
 from seaopt.control.scheduling.tuning import _count_hops
 from seaopt.errors import ControlError, FileError
 from seaopt.files import seal, to_json
+from seaopt.reporting.sections.kinds.schedule import describe_plants_at_points
 from tests.schedules import read_knee, tune_knee
 
 ROWS = {
@@ -234,6 +235,19 @@ def test_witnesses_are_kept_at_the_points_and_the_fallback_has_the_least_ms(stan
     for schedule in (alone, kept):
         worst = [max(find_ms(law, thor.update(J=at)) for at in points) for law in schedule.controllers]
         assert schedule.fallback == points[int(np.argmin(worst))]
+
+
+def test_plants_that_are_judged_at_the_points_alone_are_named(stand, thor):
+    """Here a draw breaks the limit between them, of which the verdict knows nothing."""
+    points, drawn, value = [3e5, 9e5], {"J": 0.6 * thor["J"].value}, 6e5
+    spec = so.ControllerSpec(bandwidth_hz=30, structure="pid", max_sensitivity=1.6, max_noise_gain=60)
+    schedule = tune_schedule(stand, thor, spec, "k", points, {"other": stand}, draws=[drawn])
+    assert schedule.met and schedule.at(value).close(stand, thor.update(k=value, **drawn)).figures().ms > 1.7
+    names = schedule.plants_at_points
+    assert len(names) == 2 and all("J = " in name for name in names)
+    (said,) = describe_plants_at_points(schedule)
+    assert said.startswith(f"Not judged between the points, only at them: {names[0]} and 1 more plant")
+    assert not tune_knee().plants_at_points and not describe_plants_at_points(tune_knee())
 
 
 def test_a_schedule_is_followed_from_some_of_its_points(stand, thor):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from seaopt.control import Frontier
+from seaopt.control import Frontier, ScheduledController
 from seaopt.control.frontier.rows import FrontierRow
 from seaopt.control.laws.verdict import shorten_blocked
 from seaopt.formatting import MISSING, format_number, join_words
 from seaopt.reporting.sections.data import Section, Table, mark_met
+from seaopt.reporting.sections.kinds.schedule import describe_plants_at_points
 from seaopt.units import Mechanics
 
 OBJECTIVES = {"disturbance": "integral of |S| over ln f from 0.1 Hz to the bandwidth", "noise": "noise"}
@@ -44,6 +45,7 @@ def describe(frontier: Frontier) -> list[Section]:
             remarks=(
                 *(f"not met at {join_words(bands)} Hz: {text}" for text, bands in blocked.items()),
                 _explain_columns(frontier, called),
+                *_describe_plants_at_points(frontier),
             ),
         )
     ]
@@ -52,6 +54,12 @@ def describe(frontier: Frontier) -> list[Section]:
 def _name_worst(frontier: Frontier, row: FrontierRow) -> str:
     """Return the plant with the largest Ms, and of a schedule where."""
     return row.ms_plant if row.ms_place is None else f"{row.ms_plant}, {frontier.over} = {row.ms_place:.4g}"
+
+
+def _describe_plants_at_points(frontier: Frontier) -> list[str]:
+    """Return what a schedule's rows do not say, of the first: all have the same plants."""
+    first = frontier.controllers[0] if frontier.controllers else None
+    return describe_plants_at_points(first) if isinstance(first, ScheduledController) else []
 
 
 def _explain_columns(frontier: Frontier, called: Mechanics) -> str:

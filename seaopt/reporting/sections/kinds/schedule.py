@@ -54,7 +54,11 @@ def describe(schedule: ScheduledController) -> list[Section]:
             part="schedule",
             sentences=("The gains are interpolated between the points.",),
             tables=(Table(label="Gains at the points", head=head, rows=rows, align=">" * (len(head) - 1) + "<"),),
-            remarks=(_describe_between(schedule), *describe_surroundings(schedule.controllers[0])),
+            remarks=(
+                _describe_between(schedule),
+                *describe_plants_at_points(schedule),
+                *describe_surroundings(schedule.controllers[0]),
+            ),
         ),
         *list_notes("the schedule", schedule.notes),
     ]
@@ -69,3 +73,12 @@ def _describe_between(schedule: ScheduledController) -> str:
         f"Hz, Ms up to {max(place.ms for place in schedule.between):.3f}, Mt up to "
         f"{max(place.mt for place in schedule.between):.3f}."
     )
+
+
+def describe_plants_at_points(schedule: ScheduledController) -> list[str]:
+    """Return that draws and other plants say nothing between the points; nothing where there are none."""
+    names = schedule.plants_at_points
+    if not names:
+        return []
+    more = f" and {format_count(len(names) - 1, 'more plant')}" if len(names) > 1 else ""
+    return [f"Not judged between the points, only at them: {names[0]}{more}; a certificate draws there too."]
