@@ -313,7 +313,11 @@ class Session:
         if changed - {ROBUSTNESS}:
             if stage == "fit" and (lines := self.folder / EXPLAINED).exists():
                 again = f"if fit --explain made it, put the lines of {lines} into {self.problem.source}; else {again}"
-            raise ProblemError(f"{path}: was made from another problem file or earlier result; {again} again")
+            raise ProblemError(
+                f"{path}: was made from another problem file or earlier result; is {self.problem.source} the file of "
+                f"{self.folder}, as it was then? If it was changed on purpose, {again} again, which replaces "
+                f"{path.name}"
+            )
         if changed:
             note = f"{path}: was tuned for another [robustness] than it is judged by; {again} to tune for this one"
             self._say_once("note", [note])

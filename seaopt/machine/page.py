@@ -16,7 +16,7 @@ from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, SHORT_BY, Judged, Measured, Response
-from seaopt.machine.ticks import Gaps
+from seaopt.machine.ticks import AT_LIMIT, Gaps
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -43,6 +43,8 @@ PARTS = {
     "provenance": "Provenance",
 }
 MOST_CAUSES = 5
+TWICE = 2.0  # times the bandwidth that was asked, above which it is no longer that
+LITTLE = 0.5  # of it, below which the limit of a stuck machine says little
 OUTCOMES: dict[str, Style] = {"confirmed": "good", "refuted": "bad", "undecided": "warning"}
 MISSED = (
     "no cause was found: are these the logs of this problem, and was the C code exported from this controller.json?"
@@ -83,6 +85,11 @@ STUCK = (
     "was asked of the machine as it slides. At the amplitude of the log it is {}{}."
 )
 REACHES = ", which is what was asked"
+FASTER = ", {} times what was asked: nothing bounds it above, so look at Ms and Mt"
+WORTH = (
+    " The limit of {} is {} of what was asked: it tells a loop that runs from one that does not, and says little of "
+    "its speed."
+)
 SHORT = "; a larger reference comes nearer to what was asked"
 STABILITY = (
     "Stability is the least |1 + L| over the radius of its disc (no unit): above 1 no disc holds zero, where the loop "
@@ -214,8 +221,11 @@ def _name(row: Judged) -> str:
 def _say_stuck(row: Judged, controller: Controller) -> str:
     """Return of which bandwidth the row is, and which one was asked."""
     asked, value = controller.spec.bandwidth_hz, row.value or 0.0
-    sizes = (f"{format_number(each, 3)} Hz" for each in (asked, value))
-    return STUCK.format(*sizes, REACHES if value >= (1.0 - SHORT_BY) * asked else SHORT)
+    sizes = [f"{format_number(each, 3)} Hz" for each in (asked, value, row.limit)]
+    reaches = FASTER.format(format_number(value / asked, 2)) if value > TWICE * asked else REACHES
+    said = STUCK.format(*sizes[:2], reaches if value >= (1.0 - SHORT_BY) * asked else SHORT)
+    little = row.limit is not None and row.limit < LITTLE * asked
+    return said + (WORTH.format(sizes[2], f"{100.0 * (row.limit or 0.0) / asked:.0f} %") if little else "")
 
 
 def _say_refuted(row: Judged) -> str:
@@ -402,6 +412,8 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     )
     if rows_of and read_gains(result.controller) is None:
         remarks += (NO_GAINS,)
+    if result.replayed:
+        remarks += (_say_reach(result),)
     remarks += tuple(
         _say_gaps(Path(source).name, gaps) for source, gaps in zip(result.sources, result.gaps, strict=True) if gaps
     )
@@ -432,6 +444,20 @@ def _describe_replay(result: Acceptance) -> list[Section]:
                 Section(title=f"Causes that were tried on {Path(source).name}", part="causes", tables=(table,))
             )
     return sections
+
+
+def _say_reach(result: Acceptance) -> str:
+    """Return up to which command the logs judge the machine."""
+    most, mostly = (
+        max(values) for values in zip(*((row.command_most, row.command_mostly) for row in result.replays), strict=True)
+    )
+    unit, limit = unit_after(result.controller.command.unit), result.controller.command_limit
+    sizes = [f"{format_number(each, 3)}{unit}" for each in (most, mostly)]
+    allowed = "" if limit is None or most >= AT_LIMIT * limit else f", of {format_number(limit, 3)}{unit} allowed"
+    return (
+        f"The command goes up to {sizes[0]}{allowed}, in 95 % of the ticks to {sizes[1]}: a drive or machine that is "
+        "another one only above that is not seen."
+    )
 
 
 def _say_gaps(name: str, gaps: Gaps) -> str:

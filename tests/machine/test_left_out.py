@@ -12,7 +12,8 @@ import seaopt as so
 from seaopt.control import PlausibilityGate
 from seaopt.files import to_json
 from seaopt.machine.page import write_acceptance_page
-from seaopt.machine.response.periods import Played
+from seaopt.machine.response.periods import Played, shorten
+from seaopt.machine.ticks import take_ticks
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES, REFERENCE
 
@@ -94,6 +95,11 @@ def test_periods_beside_gaps_say_what_they_say_without(controller, bench):
     )
     assert part.periods == len(kept) and np.allclose(part.f, LINES)
     assert np.allclose(part.tracking.value, force / goal, rtol=1e-9)
+
+
+def test_what_is_simulated_beside_a_log_with_gaps_has_its_reference_whole(controller, bench):
+    log = lose(bench.log(Machine(), REFERENCE), [500, 501, 1700, 2500])
+    assert np.array_equal(shorten(take_ticks(controller, log, whole=True)).reference, REFERENCE[: 3 * PERIOD])
 
 
 def test_a_gap_of_a_period_and_more_begins_a_stretch(controller, bench):

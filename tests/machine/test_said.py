@@ -1,0 +1,51 @@
+"""What an acceptance says of how far it goes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from tests.machine.simulator import Machine
+from tests.machine.test_left_out import read_everywhere
+from tests.machine.test_response import REFERENCE
+
+
+@pytest.fixture(scope="module")
+def judged(controller, bench):
+    fading = np.minimum(np.arange(REFERENCE.size) / 1000, 1.0)
+    log = bench.log(Machine(), REFERENCE * fading)
+    return log, so.accept(controller, [log])
+
+
+def test_up_to_which_command_the_log_judges_is_data_and_said(judged, tmp_path):
+    log, result = judged
+    terminal, page, record = read_everywhere(result, tmp_path)
+    (row,) = record["replay"]["logs"]
+    size = np.sort(np.abs(log["I"]))
+    assert row["command_most"] == size[-1]
+    assert size[int(0.95 * size.size) - 1] <= row["command_mostly"] <= size[int(0.95 * size.size) + 1]
+    says = f"The command goes up to {size[-1]:.3g} A, of 9 A allowed, in 95 % of the ticks to"
+    assert says in terminal and says in page
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (15.0, "a larger reference comes nearer"),
+        (31.0, "which is what was asked"),
+        (66.0, "2.2 times what was asked"),
+    ],
+)
+@pytest.mark.parametrize(("limit", "little"), [(5.4, True), (27.0, False)])
+def test_a_stuck_bandwidth_is_said_beside_what_was_asked(judged, value, says, limit, little):
+    _, result = judged
+    rows = [
+        replace(row, state="stuck", value=value, limit=limit) if row.name == "bandwidth" else row
+        for row in result.response.judged
+    ]
+    text = " ".join(repr(replace(result, response=replace(result.response, judged=tuple(rows)))).split())
+    assert says in text
+    assert ("The limit of 5.4 Hz is 18 % of what was asked" in text) == little
