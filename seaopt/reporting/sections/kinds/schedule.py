@@ -77,7 +77,7 @@ def _describe_between(schedule: ScheduledController) -> str:
 
 def describe_plants_at_points(schedule: ScheduledController) -> list[str]:
     """Return that draws and other plants say nothing between the points; nothing where there are none."""
-    names = schedule.plants_at_points
+    names = list(schedule.plants_at_points)
     if not names:
         return []
     more = f" and {format_count(len(names) - 1, 'more plant')}" if len(names) > 1 else ""
