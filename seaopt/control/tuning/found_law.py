@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol, Self, TypeVar
+from typing import Protocol, Self, TypeVar, runtime_checkable
 
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
@@ -35,6 +35,7 @@ OUTER_ROUNDS = 6  # of tuning with an outer loop that follows
 Surround = Callable[[Controller], OuterLoop | None]
 
 
+@runtime_checkable
 class Enclosed(Protocol):
     """What an outer loop is around: a controller, or a schedule of them."""
 
@@ -54,6 +55,7 @@ class Enclosed(Protocol):
         ...
 
 
+@runtime_checkable
 class Found(Protocol):
     """What was found of a task, or of the tasks of a schedule."""
 
