@@ -70,6 +70,7 @@ class Candidate:
     kept: tuple[Experiment, ...] = ()
     frees: Mapping[str, float] = field(default_factory=dict[str, float])  # whose values to state, less these offsets
     apart: bool = False  # each output has a delay of its own
+    further: bool = False  # it frees more than the one before, and is worth a look where that explains something
     smoothed: Parameter | None = None  # what is freed, if it is a speed over which friction is smoothed
 
     def jumps(self, values: Values, stds: Values) -> bool:
@@ -273,6 +274,7 @@ def _free_delays(problem: FitProblem, params: ParameterSet, *, poor: bool) -> It
             delays=names,
             kept=kept,
             frees=dict(zip((*names, damper.name), (*shifts, 0.0), strict=True)),
+            further=not poor,
         )
     apart = tuple(_take_output(e, output) for e in shifted for output in e.outputs)
     delays = tuple(f"{e.name}.delay_s" for e in apart)

@@ -104,7 +104,11 @@ def find_causes(
     causes: list[Cause] = []
     candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor, noticed=noticed))
     causes += _weigh_hypotheses(fit, hypotheses, whole, colour)
+    explained = False
     for number, candidate in enumerate(candidates, start=1):
+        if candidate.further and not explained:
+            continue
+        explained = False
         spent = 0.0 if budget is None else budget.share
         if spent >= 1.0:
             break
@@ -120,6 +124,7 @@ def find_causes(
         cause = _weigh(fit, candidate, solved.problem, solved.solution.evaluation, before, colour, poor=poor)
         if cause is not None:
             causes.append(cause)
+            explained = True
             if poor and cause.solved:
                 break
     best = max((cause.gain for cause in causes), default=0.0)

@@ -20,10 +20,10 @@ from seaopt.estimation.solver.step_shares import copy_steps
 HELD_OUT = 0.3  # of each log, its end, where the fit holds out nothing
 BLOCKS = 20  # of each log's end, whose differences are taken for independent
 
-Minimum = tuple[FitProblem, Vector]
 
-
-def compare_held_out(first: Minimum, second: Minimum) -> float:
+def compare_held_out(
+    first: tuple[FitProblem, Float[np.ndarray, " n"]], second: tuple[FitProblem, Float[np.ndarray, " m"]]
+) -> float:
     """Return by how many standard deviations the first minimum is nearer than the second to what neither was fitted to.
     Both are of the same outputs of the same logs, which either may have as experiments of their own.
     """
@@ -35,7 +35,7 @@ def compare_held_out(first: Minimum, second: Minimum) -> float:
     return float(np.mean(blocks) / max(np.std(blocks, ddof=1) / np.sqrt(BLOCKS), 1e-300))
 
 
-def _list_held_out(problem: FitProblem, z: Vector) -> list[Float[np.ndarray, " n"]]:
+def _list_held_out(problem: FitProblem, z: Vector) -> list[Float[np.ndarray, " k"]]:
     """Return each output's squared residuals over the last part of its log, at the minimum over the rest."""
     if not problem.holdout:
         rest = pose_problem(
@@ -49,7 +49,7 @@ def _list_held_out(problem: FitProblem, z: Vector) -> list[Float[np.ndarray, " n
         solved = settle_roughly(rest, rest.evaluate(z), checked=True)
         problem, z = solved.problem, solved.solution.evaluation.z
     residuals = compute_residuals(problem, z)
-    rows: list[Float[np.ndarray, " n"]] = []
+    rows: list[Float[np.ndarray, " k"]] = []
     for experiment in problem.experiments:
         parts = zip(experiment.segments, residuals[experiment.name].segments, strict=True)
         squares = [left.raw[part.samples.keep[0] == 0] ** 2 for part, left in parts]

@@ -21,13 +21,13 @@ PLANT = so.Plant(
     states={"x": "m"}, inputs={"F": "N"}, outputs={"y": "N", "z": "rad", "w": "rad"}, parameters={"k": "1/s"},
     f=lambda t, x, u, p: {"x": u.F - p.k * x.x}, h=lambda t, x, u, p: {"y": x.x, "z": 2 * x.x, "w": 3 * x.x},
 )  # fmt: skip
-LINKS = [
+LINKS = tuple(
     LinkPath(
         measured="w", unit="rad", inertia=scale * 0.3, damping=0.5, fraction=0.8, corner_hz=40.0 * scale,
         high_pass_hz=0.5, is_speed=False,
     )
     for scale in (1.0, 1.3, 1.5)
-]  # fmt: skip
+)  # fmt: skip
 
 
 @cache
