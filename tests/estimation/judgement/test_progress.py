@@ -64,4 +64,5 @@ def test_a_fit_that_is_read_from_a_file_advises_to_stick_as_a_fresh_one_does():
     for result in (fresh, read):
         (cause,) = (finding for finding in result.findings if finding.kind == "cause")
         assert (cause.proposal, cause.preferred) == ("[plant.NAME]\nsticks = true", {})
-        assert "sticks = true in [plant.NAME]" in str(result).split("\n\n")[0].replace("\n", " ")
+        said = " ".join(str(result).split("\n\n")[0].split())
+        assert "write under [plant.NAME]" in said and said.endswith("sticks = true")
