@@ -24,7 +24,6 @@ from seaopt.records import record
 
 SIGMAS = 4.0  # of what rounding allows
 HIDES = 0.003  # of the command's rms, above which what is taken for rounding may be a fault
-MOSTLY = 0.95  # of the ticks
 COARSEST = 0.1  # of the command's rms, that rounding may allow of a replay that decides
 
 
@@ -45,8 +44,8 @@ class Replay:
     law_rate_hz: float
     ticks_per_row: int = 1  # of a log that has every n-th tick: it was compared line by line
     causes: tuple[Cause, ...] = ()
-    command_most: float = 0.0  # the largest size of the logged command: of what is beyond it the log tells nothing
-    command_mostly: float = 0.0  # what it is below in 95 % of the ticks
+    command_most: float = 0.0  # command_most, command_mostly: as in `Ticks`, of the logged command
+    command_mostly: float = 0.0
     possible: tuple[Cause, ...] = ()  # of a log with every n-th tick: laws with other parts that it does not exclude
 
     @property
@@ -102,8 +101,8 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
         off_from=None if match.met or not off.size else int(off[0]),
         saturated=find_saturated(ticks, whole.linear.command_limit),
         command_late=late,
-        command_most=float(np.max(np.abs(ticks.command))),
-        command_mostly=float(np.quantile(np.abs(ticks.command), MOSTLY)),
+        command_most=ticks.command_most,
+        command_mostly=ticks.command_mostly,
         rate_hz=rate_hz,
         law_rate_hz=law_rate_hz,
         causes=causes,
@@ -140,8 +139,8 @@ def _describe_lines(setting: Setting, match: LineMatch, ticks_per_row: int) -> R
         off_from=None,
         saturated=find_saturated(ticks, setting.linear.command_limit),
         command_late=match.late,
-        command_most=float(np.max(np.abs(ticks.command))),
-        command_mostly=float(np.quantile(np.abs(ticks.command), MOSTLY)),
+        command_most=ticks.command_most,
+        command_mostly=ticks.command_mostly,
         rate_hz=ticks.rate_hz,
         law_rate_hz=1.0 / setting.controller.sample_time_s,
         ticks_per_row=ticks_per_row,

@@ -22,6 +22,7 @@ from seaopt.signals import REFERENCES
 AT_LIMIT = 1.0 - 1e-6  # of the command's limit, from which on it is there
 FORGETS = 35.0  # time constants in which nothing is left of a start
 FEWEST_FLAT, FEWEST_VISITS, FLAT = 10, 3, 3  # readings at the edge of a range, visits of it, and rows of one
+MOSTLY = 0.95  # of the ticks
 FEWEST = 50  # ticks that a replay takes at least
 
 
@@ -92,6 +93,16 @@ class Ticks:
         changes = np.flatnonzero(np.diff(self.command)) + 1
         phase = int(np.argmax(np.bincount(changes % every, minlength=every))) if changes.size else 0
         return self.take(slice(phase, None, every))
+
+    @property
+    def command_most(self) -> float:
+        """The largest size of the command: of what is beyond it the log tells nothing."""
+        return float(np.max(np.abs(self.command)))
+
+    @property
+    def command_mostly(self) -> float:
+        """What the size of the command is below in 95 % of the ticks."""
+        return float(np.quantile(np.abs(self.command), MOSTLY))
 
     @property
     def middle(self) -> float | None:
