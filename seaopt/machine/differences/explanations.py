@@ -43,8 +43,8 @@ MODE_DAMPINGS = (0.02, 0.1)
 SEEN = 5.0  # std by which a line differs where a mode is looked for
 MODE_COST = 2.0  # by which a mode, of several sizes, has to leave less than another cause does
 LEAST_DAMPING, MOST_DAMPED = math.log(1e-4), 0.3
-RATES = np.geomspace(0.1, 10.0, 61)  # over that of the clock, at which the law is tried to be stepped
-USUAL_RATES = (0.5, 2.0, 0.1, 0.2, 0.25, 1.0 / 3.0, 3.0, 4.0, 5.0, 10.0)  # the first two are tried always
+# Over that of the clock, at which timers step a law by mistake; the first two are tried always.
+USUAL_RATES = (0.5, 2.0, 0.1, 0.2, 0.25, 1.0 / 3.0, 3.0, 4.0, 5.0, 10.0)
 SAME_RATE = 0.01  # relative: a rate that is a usual one
 RATE_COST = 2.0  # by which such a rate may leave more than another cause does
 MOST = 4  # causes that are listed
@@ -270,8 +270,8 @@ def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> I
         left = comparison.misfit(at(log).predict([values])[0])
         return left if math.isfinite(left) else math.inf  # of a loop that runs away at that rate
 
-    sliding = [comparison.misfit(replace(comparison, rate=rate).linearise(values)) for rate in RATES]
-    log = min(map(math.log, (*USUAL_RATES[:2], float(RATES[int(np.nanargmin(sliding))]))), key=misfit)
+    sliding = [comparison.misfit(replace(comparison, rate=rate).linearise(values)) for rate in USUAL_RATES]
+    log = min(map(math.log, {*USUAL_RATES[:2], USUAL_RATES[int(np.nanargmin(sliding))]}), key=misfit)
     best: _Best | None = None
     for _ in range(ROUNDS):
         (model,), (after,) = at(log).predict([values]), at(log + STEP).predict([values])
@@ -285,8 +285,8 @@ def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> I
         if abs(best.sizes[0]) <= FOUND:
             break
     assert best is not None
-    far, rate = 1.96 * best.std, math.exp(log)
-    rate = next((each for each in USUAL_RATES if abs(rate / each - 1.0) <= SAME_RATE), None)
+    far = 1.96 * best.std
+    rate = next((each for each in USUAL_RATES if abs(math.exp(log) / each - 1.0) <= SAME_RATE), None)
     if rate is None:
         return
     value = rate / comparison.controller.sample_time_s
