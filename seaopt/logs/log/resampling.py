@@ -226,10 +226,9 @@ def _count_lost(late: VectorN) -> VectorN:
     base = np.maximum.accumulate(np.round(np.min(ahead, axis=1))) - 1.0
     misfits = np.abs(np.clip(off[:, None] - base[:, None] - np.arange(LEVELS), -1.0, MOST_LATE))
     costs, came = misfits[0].tolist(), np.zeros(misfits.shape, dtype=np.int64)
-    for row, (moved, misfit) in enumerate(zip(np.diff(base, prepend=base[0]).tolist(), misfits.tolist(), strict=True)):
-        if row == 0:
-            continue
-        moved, lowest = int(moved), min(range(min(int(moved), LEVELS)), key=costs.__getitem__, default=-1)
+    moves = np.diff(base).astype(int).tolist()
+    for row, (moved, misfit) in enumerate(zip(moves, misfits[1:].tolist(), strict=True), start=1):
+        lowest = min(range(min(moved, LEVELS)), key=costs.__getitem__, default=-1)
         before, costs = costs, []
         for level in range(LEVELS):
             same = level + moved
