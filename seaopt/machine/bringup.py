@@ -18,7 +18,7 @@ from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
 from seaopt.machine.design_run import run_design
 from seaopt.machine.excitation import Excitation, design_excitation
-from seaopt.machine.response.verdicts import LEAST_PHASES, find_friction, has_dry_friction
+from seaopt.machine.response.verdicts import LEAST_PHASES, AgainstFriction, find_friction, has_dry_friction
 from seaopt.machine.stepped import Source, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -57,7 +57,7 @@ class Band:
 
 
 @record(eq=False)
-class Stage:
+class Stage(AgainstFriction):
     """One law on its way to the machine.
 
     Parameters
@@ -104,11 +104,6 @@ class Stage:
     place: float | None = None
     effort: float | None = None
     friction: float | None = None
-
-    @property
-    def still(self) -> bool:
-        """Whether dry friction holds the motor while this is played."""
-        return self.effort is not None and self.friction is not None and self.effort <= self.friction
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -158,9 +153,7 @@ def _describe(stage: Stage) -> dict[str, Any]:
             "phases": len(excitation.waves),
             "frequency_hz": excitation.frequency_hz,
         },
-        "friction": None
-        if stage.friction is None
-        else {"dry": stage.friction, "effort": stage.effort, "moves": not stage.still},
+        "friction": stage.motion,
         "peaks": excitation.peaks,
         "limits": excitation.limits,
         "stop": stage.stop,

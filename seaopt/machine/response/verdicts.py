@@ -52,8 +52,27 @@ NYQUIST = 0.8  # of half the sample rate, above which no line has to lie
 ON_GRID = 0.05  # relative, by which the outermost lines may miss, which lie on multiples of the period's
 
 
+class AgainstFriction:
+    """What has an effort that swings, and dry friction that it is to overcome; None where there is none."""
+
+    effort: float | None
+    friction: float | None
+
+    @property
+    def still(self) -> bool:
+        """Whether dry friction holds the motor in all periods."""
+        return self.effort is not None and self.friction is not None and self.effort <= self.friction
+
+    @property
+    def motion(self) -> dict[str, Any] | None:
+        """Content for JSON."""
+        if self.friction is None:
+            return None
+        return {"dry": self.friction, "effort": self.effort, "moves": not self.still}
+
+
 @record(eq=False)
-class Response:
+class Response(AgainstFriction):
     """The measured loop, and its limits."""
 
     met: bool
@@ -67,11 +86,6 @@ class Response:
     friction: float | None = None  # which dry friction takes: below it the motor does not move
     rate: float = 1.0  # of the law, over what the clock of the logs says: Hz and seconds are those of the machine
 
-    @property
-    def still(self) -> bool:
-        """Whether dry friction held the motor in all periods that were judged."""
-        return self.effort is not None and self.friction is not None and self.effort <= self.friction
-
     def to_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
         return {
@@ -82,9 +96,7 @@ class Response:
             "needs_phases": self.needs_phases,
             "needs_lines_hz": self.needs_lines,
             "rate": self.rate,
-            "friction": None
-            if self.friction is None
-            else {"dry": self.friction, "effort": self.effort, "moves": not self.still},
+            "friction": self.motion,
             "measured": [_describe_lines(part, 1.0 - self.confidence) for part in self.measured],
         }
 
