@@ -129,8 +129,7 @@ def find_causes(
                 break
     best = max((cause.gain for cause in causes), default=0.0)
     # Of explanations that chance alone sets apart, the one that frees least comes first.
-    near = {id(cause) for cause in causes if cause.gain >= best - ENOUGH}
-    causes = sorted(causes, key=lambda c: (id(c) not in near, c.z.size if id(c) in near else 0, -c.gain))
+    causes.sort(key=lambda c: (c.gain < best - ENOUGH, c.z.size if c.gain >= best - ENOUGH else 0, -c.gain))
     return _drop_worse(fit, causes)
 
 
