@@ -22,6 +22,7 @@ class Runaway:
 
     reading: float | None  # that the regulated reading ran to, away from the reference; None where it did not
     limited: bool  # the command stays at its limit until the log ends
+    swing: float  # of the reference
 
 
 def find_runaway(controller: Controller, ticks: Ticks) -> Runaway | None:
@@ -34,7 +35,7 @@ def find_runaway(controller: Controller, ticks: Ticks) -> Runaway | None:
     limited = _stays_at_limit(np.sign(ticks.command), np.abs(ticks.command), controller.command_limit or np.inf)
     if not grew and not limited:
         return None
-    return Runaway(reading=float(ticks.measured[-1, 0]) if grew else None, limited=limited)
+    return Runaway(reading=float(ticks.measured[-1, 0]) if grew else None, limited=limited, swing=swing)
 
 
 def _stays_at_limit(sign: np.ndarray, size: np.ndarray, limit: float) -> bool:
@@ -54,8 +55,7 @@ def say_runaway(controller: Controller, ticks: Ticks) -> str | None:
     lasts, said = len(ticks) / ticks.rate_hz, list[str]()
     if found.reading is not None:
         unit, name = unit_after(command.reference_unit), controller.signals[0]
-        swing = f"{float(np.ptp(ticks.reference[ticks.complete])):.3g}{unit}"
-        said.append(f"{name} ran to {found.reading:.3g}{unit} under a reference that swings by {swing}")
+        said.append(f"{name} ran to {found.reading:.3g}{unit} under a reference that swings by {found.swing:.3g}{unit}")
     if found.limited:
         limit = f"{controller.command_limit:.3g}{unit_after(command.unit)}"
         said.append(f"{command.input} went to its limit of {limit} and stayed there")
