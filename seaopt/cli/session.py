@@ -55,7 +55,7 @@ from seaopt.progress import Progress, count_off, divide
 from seaopt.reporting import write_frontier_figure, write_report
 from seaopt.reporting.responses import estimate_responses
 from seaopt.reporting.sections import judge
-from seaopt.reporting.sections.data import Commands, Verdict
+from seaopt.reporting.sections.data import Commands, Step, Verdict
 from seaopt.reporting.sections.verdict import UNMET, doubt_design, judge_expectations, name_guesses
 from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
@@ -543,7 +543,7 @@ class Session:
         if stage == "frf":
             return [Verdict(met=good, text=text) for good, text in result.verdict()]
         if stage == "sweep":
-            mend = f"mend the fit: {self._spell('fit')}"
+            mend = Step(text="mend the fit:", copied=(self._spell("fit"),))
             return [] if self.fit_met() else [Verdict(met=False, text=UNMET, next=(mend,))]
         verdicts: list[Verdict] = []
         if stage == "tune":
@@ -570,7 +570,7 @@ class Session:
             return [doubt_design(verdict) for verdict in verdicts]
         if self.problem.refused:  # a warning that a long fit's progress has left behind
             wrong = f"{self.problem.refused}; a design refuses this"
-            verdicts = [replace(each, next=(*each.next, wrong)) for each in verdicts]
+            verdicts = [replace(each, next=(*each.next, Step(text=wrong))) for each in verdicts]
         guesses = state_guesses(self.problem.table.guessed)
         return [name_guesses(verdict, guesses) for verdict in verdicts]
 

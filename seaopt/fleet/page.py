@@ -20,7 +20,18 @@ from seaopt.fleet.scatter import BETWEEN_HEAD
 from seaopt.fleet.worker import FAILED, MET, NOT_MET
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.reporting.page.fleet import ActuatorTable, Cell, Row, draw_trend, write_page
-from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Mark, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import (
+    Commands,
+    Item,
+    KeyFigure,
+    Mark,
+    Reason,
+    Section,
+    Step,
+    Table,
+    Verdict,
+    mark_met,
+)
 from seaopt.units import unit_after
 
 MOST_DRAWN = 300  # actuators with drawings: the worst
@@ -42,7 +53,7 @@ def judge(result: Fleet | Drift | Population, commands: Commands) -> Verdict | N
     if isinstance(result, Fleet):
         reasons = tuple(Reason(what=f"{text} ({log})", count=count) for text, count, log in result.reasons)
         advice = {REPAIR: result.counts[FAILED], REFIT: result.counts[NOT_MET]} if commands.fit else {}
-        advised = tuple(text for text, count in advice.items() if count)
+        advised = tuple(Step(text=text) for text, count in advice.items() if count)
         return Verdict(met=result.met, text=f"Fleet: {result.verdict}", reasons=reasons, next=advised)
     if isinstance(result, Population) or result.missing:
         return None

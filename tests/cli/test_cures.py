@@ -49,7 +49,7 @@ theta_m = "theta_m [rad]"
 
 def write_under(text, advice):
     """Return a file with lines where an advice says, in place of lines of the same name."""
-    said, *lines = advice.splitlines()
+    said, lines = advice.text, advice.copied
     (header,) = re.findall(r"write under (\[\S+\])", said)
     anchor = f'log = "{said.split()[3].rstrip(",")}.csv"' if header == "[[experiment]]" else header
     assert text.count(anchor) == 1
@@ -90,6 +90,6 @@ def test_each_plant_keeps_its_own_parts():
     )
     fit = SimpleNamespace(findings=(cause,), hypotheses=(trial,), parameters={}, experiments=())
     held, swing, values = _list_cures(fit, {"held": ("current_loop",), "swing": ("cogging",)})
-    assert held.endswith('\nparts = ["current_loop", "spring_damping"]') and "[plant.held]" in held
-    assert swing.endswith('\nparts = ["cogging", "spring_damping"]') and "[plant.swing]" in swing
-    assert values.endswith("\nc_k = { value = 600, free = true }")
+    assert held.copied == ('parts = ["current_loop", "spring_damping"]',) and "[plant.held]" in held.text
+    assert swing.copied == ('parts = ["cogging", "spring_damping"]',) and "[plant.swing]" in swing.text
+    assert values.copied == ("c_k = { value = 600, free = true }",)

@@ -29,7 +29,7 @@ def test_a_plant_that_was_not_tuned_for_is_named_and_helps_when_it_is(stand, tho
     plants = {"stand": stand, "swing": so.plants.moving_output()}
     alone = so.tune(stand, thor, SPEC)
     certificate = so.certify(alone, plants, thor, simulations=False)
-    assert judge(certificate, Commands()).next[0].startswith('add "swing" to robust_to in [controller]')
+    assert judge(certificate, Commands()).next[0].text.startswith('add "swing" to robust_to in [controller]')
     both = so.tune(stand, thor, SPEC, robust_to={"swing": plants["swing"]})
     assert so.certify(both, plants, thor, simulations=False).met
 
@@ -59,8 +59,11 @@ def test_a_weight_that_the_tuner_does_not_see_is_compensated_less():
 
     refused = certify(0.95)
     verdict = judge(refused, Commands())
-    assert verdict.next[0].startswith(REMEDIES["gravity_compensation"])
-    assert not any("retune" in text or "robust_to" in text for text in (*verdict.next, *map(str, verdict.reasons)))
+    assert verdict.next[0].text.startswith(REMEDIES["gravity_compensation"])
+    assert not any(
+        "retune" in text or "robust_to" in text
+        for text in (*(step.text for step in verdict.next), *map(str, verdict.reasons))
+    )
     drawn = tuple(row for row in refused.requirements if row.name != "gravity_compensation")
     assert judge(replace(refused, requirements=drawn), Commands()).next[0] == verdict.next[0]  # by the worst plant
     rounds = JointTuning(status="rounds", controller=law, certificate=refused, rounds=(), robust_to={})
@@ -87,7 +90,7 @@ def test_a_link_that_nothing_holds_is_what_an_integral_fails_on(stand, thor):
     controller = so.tune(stand, values, SPEC, robust_to=plants)
     verdict = controllers.judge(controller, Commands())
     assert "nothing holds the link there" in verdict.reasons[0].what
-    assert not any("raise" in text or "lower" in text for text in verdict.next)
+    assert not any("raise" in step.text or "lower" in step.text for step in verdict.next)
     certificate = so.certify(controller, plants, values, samples=2, simulations=False)
     where = judge(certificate, Commands()).reasons[0].where
     assert "nothing holds the link there" in where and "tune with that plant" not in where

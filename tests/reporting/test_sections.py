@@ -13,9 +13,10 @@ from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Terminal
 from seaopt.estimation.result.findings import DerivedFigure
 from seaopt.reporting.sections import judge
-from seaopt.reporting.sections.data import Item, Mark, Reason, Section, Table, Verdict
+from seaopt.reporting.sections.data import Item, Mark, Reason, Section, Step, Table, Verdict
 from seaopt.reporting.sections.glossary import GLOSSARY, explain_terms
 from seaopt.reporting.sections.html import render_section
+from seaopt.reporting.sections.html import render_verdict as render_html_verdict
 from seaopt.reporting.sections.kinds.fit import spell_cure
 from seaopt.reporting.sections.text import Most, join, render_sections, render_table, render_verdict
 
@@ -53,10 +54,11 @@ def test_where_the_width_lacks_what_is_optional_goes_and_an_empty_column_always_
 def test_a_long_reason_is_wrapped_and_a_command_stays_on_one_line():
     command = f"seaopt run {'folder/' * 20}problem.toml"
     verdict = Verdict(
-        met=False, text="Fit: stalled", reasons=(Reason(what="F1", where=WORDS * 5),), next=(f"type {command}",)
+        met=False, text="Fit: stalled", reasons=(Reason(what="F1", where=WORDS * 5),), next=(Step.typed("", command),)
     )
     lines = join(render_verdict(verdict)).splitlines()
-    assert lines[0] == "not met  Fit: stalled" and command in lines[-1]
+    assert lines[0] == "not met  Fit: stalled" and lines[-1].strip() == command
+    assert f"next: type<pre>{command}</pre>" in render_html_verdict(verdict)
     assert max(map(len, lines[:-1])) <= 80 and "..." not in "".join(lines) and "…" not in "".join(lines)
     assert "".join(WORDS.split()) * 5 in "".join("".join(lines).split())
 

@@ -104,15 +104,26 @@ class Reason:
 
 
 @record
+class Step:
+    """What to do next, and what to copy for it as it is: a command, or lines of a problem file."""
+
+    text: str
+    copied: tuple[str, ...] = ()
+
+    @classmethod
+    def typed(cls, text: str, command: str) -> Step:
+        """Return what to do with a command at its end, which is typed."""
+        return cls(text=f"{text} type" if text else "type", copied=(command,))
+
+
+@record
 class Verdict:
-    """Whether a result is met, in one line; why not; and what comes next: a command, or what to write where, with the
-    lines of a problem file below it, to be copied as they are.
-    """
+    """Whether a result is met, in one line; why not; and what comes next."""
 
     met: bool
     text: str
     reasons: tuple[Reason, ...] = ()
-    next: tuple[str, ...] = ()
+    next: tuple[Step, ...] = ()
     words: tuple[str, str] = field(default=("met", "not met"))
 
 

@@ -34,12 +34,11 @@ def render_section(section: Section, *, title: bool = True) -> str:
 def render_verdict(verdict: Verdict) -> str:
     """Return a verdict with its reasons and what comes next."""
     mark = mark_met(verdict.met, *verdict.words)
-    steps = (text.splitlines() for text in verdict.next)  # what to do, and lines to be copied
     lines = [
         *(_escape(str(reason)) for reason in verdict.reasons),
         *(
-            f"next: {_escape(said)}" + (f"<pre>{_escape(chr(10).join(copied))}</pre>" if copied else "")
-            for said, *copied in steps
+            f"next: {_escape(step.text)}" + (f"<pre>{_escape(chr(10).join(step.copied))}</pre>" if step.copied else "")
+            for step in verdict.next
         ),
     ]
     reasons = "".join(f"<li>{line}</li>" for line in lines)

@@ -19,7 +19,6 @@ INDENT = 2
 LEAST = 20  # characters of a wrapped text
 NARROW = 16  # characters of a text in a table that is never broken
 GAP = 2
-COMMAND = "type seaopt"
 LABEL = 9  # characters before the text of a verdict, a reason and a finding
 COLOURS = {"good": "green", "bad": "red", "error": "bold red", "warning": "yellow", "note": "dim"}
 
@@ -69,13 +68,9 @@ def render_verdict(verdict: Verdict, width: int = WIDTH, most: Most | None = Non
     for reason in verdict.reasons[: most.reasons]:
         lines += wrap(str(reason), width, indent=LABEL)
     lines += _count_hidden(len(verdict.reasons), most.reasons, LABEL)
-    for text in verdict.next:
-        said, *copied = text.splitlines()
-        advice, command, options = said.partition(COMMAND)
-        lines += wrap(f"next: {advice}{'type' if command else ''}", width, indent=LABEL)
-        if command:
-            copied = [f"seaopt{options}"]
-        lines += [((f"{' ' * (LABEL + 2)}{line}", ""),) for line in copied]
+    for step in verdict.next:
+        lines += wrap(f"next: {step.text}", width, indent=LABEL)
+        lines += [((f"{' ' * (LABEL + 2)}{line}", ""),) for line in step.copied]
     return lines
 
 

@@ -22,5 +22,5 @@ def test_a_damped_spring_of_a_screw_is_named_with_the_lines_that_add_it(thor):
     row = next(row for row in fit.hypotheses if row.parts == ("spring_damping",))
     assert row.frees["c_k"] == pytest.approx(600.0, rel=0.02)
     part, value, *_ = judge(fit).next
-    assert part.startswith("write under [plant.NAME]") and part.endswith('\nparts = ["spring_damping"]')
-    assert value.startswith("write under [parameters]") and "\nc_k = { value = " in value
+    assert part.text.startswith("write under [plant.NAME]") and part.copied == ('parts = ["spring_damping"]',)
+    assert value.text.startswith("write under [parameters]") and value.copied[0].startswith("c_k = { value = ")

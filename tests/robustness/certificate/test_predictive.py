@@ -90,7 +90,7 @@ def test_a_motor_much_stronger_than_its_model_fails_and_its_run_can_be_played_ag
     assert {"constrained_failures", "constrained_failure_probability"} <= broken
     assert runs.over_bound + runs.not_settled + runs.diverged == 1
     assert "fit K_tau or narrow" in runs.remedy and "qd" in runs.remedy and "max_iterations" not in runs.remedy
-    assert judge(failed, Commands(certify="seaopt certify", tune="seaopt tune")).next[0].startswith(runs.remedy)
+    assert judge(failed, Commands(certify="seaopt certify", tune="seaopt tune")).next[0].text.startswith(runs.remedy)
     torque = runs.parameters["K_tau"]
     run = close_loop(mpc.command, mpc.start, stand, thor.update(K_tau=torque), np.full(100, 2000.0))
     assert np.max(np.abs(run.state[:, 1])) > 1.05 * SPEED_LIMIT["qd"][1]

@@ -16,6 +16,7 @@ from seaopt.reporting.sections.data import (
     Mark,
     Reason,
     Section,
+    Step,
     Table,
     Verdict,
     list_notes,
@@ -91,14 +92,13 @@ def judge(certificate: Certificate, commands: Commands) -> Verdict:
     if certificate.constrained is not None:
         remedies = [certificate.constrained.remedy, *(REPLAN if text == RETUNE else text for text in remedies)]
     first = next((text for text in remedies if text), "")
-    again = f"type {commands.certify}" if commands.certify else "tune and certify again"
-    command = f"{first}; then {again}" if first else again
+    again = _repeat(first, commands, otherwise="tune and certify again")
     costs = show_costs(certificate.controller.spec.bandwidth_hz, commands)
     return Verdict(
         met=False,
         text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
         reasons=tuple(reasons),
-        next=(command, *([costs] if certificate.constrained is None else ())),
+        next=(again, *([costs] if certificate.constrained is None else ())),
     )
 
 
@@ -116,7 +116,6 @@ def _judge_schedule(certificate: Certificate, schedule: ScheduledController, com
         return Verdict(met=True, text=f"Certificate: passed with {schedule.over} standing still, {drawn}{swept}")
     broken = [row for row in certificate.requirements if not row.met]
     laws, models = schedule.controllers, certificate.models
-    command = f"type {commands.certify}" if commands.certify else "tune again"
     remedies = (row.remedy or advise(row, *laws, models=models) for row in broken)
     if certificate.fails_by_weight:
         remedies = iter([REMEDIES[GRAVITY_COMPENSATION]])
@@ -125,21 +124,25 @@ def _judge_schedule(certificate: Certificate, schedule: ScheduledController, com
         met=False,
         text=f"Certificate: failed, {len(broken)} of {len(certificate.requirements)} requirements not met",
         reasons=tuple(explain_failure(failure, *laws, models=models) for failure in group_failures(broken)),
-        next=(schedule.remedy or f"{change}; then {command}",),
+        next=(Step(text=schedule.remedy) if schedule.remedy else _repeat(change, commands, otherwise="tune again"),),
     )
 
 
-def _advise_ranges(certificate: Certificate) -> tuple[str, ...]:
+def _repeat(change: str, commands: Commands, *, otherwise: str) -> Step:
+    """Return what to change, and the command that certifies again; `otherwise` where no command was typed."""
+    first = f"{change}; then" if change else ""
+    return Step.typed(first, commands.certify) if commands.certify else Step(text=f"{first} {otherwise}".strip())
+
+
+def _advise_ranges(certificate: Certificate) -> tuple[Step, ...]:
     """Return the line of the file that makes something uncertain: a tenth about the first parameter that is not 0."""
     for plant in certificate.linear_models.values():
         for name in plant.parameters:
             value = certificate.parameters[name].value if name in certificate.parameters else 0.0
             if value:
                 low, high = sorted((0.9 * value, 1.1 * value))
-                return (
-                    f"to certify what is not known well add parameters = {{ {name} = [{low:.3g}, {high:.3g}] }} "
-                    "to [robustness]",
-                )
+                row = f"parameters = {{ {name} = [{low:.3g}, {high:.3g}] }}"
+                return (Step(text="to certify what is not known well add to [robustness]:", copied=(row,)),)
     return ()
 
 

@@ -11,7 +11,7 @@ from seaopt.control.laws.command import describe_cascade, name_gain_units
 from seaopt.control.laws.verdict import advise_easing, join_labels, list_design_figures
 from seaopt.control.loops.law import describe_integrators
 from seaopt.formatting import MISSING, format_band, format_count, format_figure, format_number
-from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, list_notes
+from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Step, Table, Verdict, list_notes
 
 NO_NOTCH = 0.999  # gain at a notch's centre from which it only adds order
 SWEEP_SPREAD = (0.6, 1.6)  # of the bandwidth asked, that a sweep for another one spans
@@ -82,25 +82,26 @@ def explain_sliding(controller: Controller) -> Iterator[str]:
         )
 
 
-def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[str, ...]:
+def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[Step, ...]:
     """Return the line of the file with a bandwidth that is possible, or how to look for what is."""
     possible, asked = controller.possible, controller.spec.bandwidth_hz
-    look = show_costs(asked, commands)
     if possible is None:
-        return (look,)
-    text = str(possible)
+        return (show_costs(asked, commands),)
+    first = Step(text=str(possible))
     if possible.nearest_hz:
         nearest = min(possible.nearest_hz, key=lambda hz: abs(hz - asked))
-        return (text, f"bandwidth_hz = {nearest:.4g} in [controller], or {look}")
+        return (first, show_costs(asked, commands, first=f"bandwidth_hz = {nearest:.4g} in [controller], or "))
     unstable = any(name.startswith("stability") for name in controller.active_constraints)
     easing = "" if unstable else advise_easing(controller.active_constraints)  # figures of no stable law bind nothing
-    return (text, f"{easing} in [controller]; {look}" if easing else look)
+    return (first, show_costs(asked, commands, first=f"{easing} in [controller]; " if easing else ""))
 
 
-def show_costs(asked: float, commands: Commands) -> str:
-    """Return how to see what bandwidths about one cost."""
-    how = f"type {commands.sweep} {_choose_range(asked)}" if commands.tune else "call seaopt.control.sweep"
-    return f"to see what other bandwidths cost {how}"
+def show_costs(asked: float, commands: Commands, *, first: str = "") -> Step:
+    """Return how to see what bandwidths about one cost; `first`: what to try before."""
+    text = f"{first}to see what other bandwidths cost"
+    if not commands.tune:
+        return Step(text=f"{text} call seaopt.control.sweep")
+    return Step.typed(text, f"{commands.sweep} {_choose_range(asked)}")
 
 
 def _choose_range(asked: float) -> str:

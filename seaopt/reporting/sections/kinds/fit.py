@@ -10,7 +10,7 @@ from seaopt.estimation.result.findings import DerivedFigure, LogValues
 from seaopt.estimation.result.trials import spell_parameters, spell_parts
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.parameters import Parameter
-from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, list_notes
+from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Step, Table, Verdict, list_notes
 from seaopt.units import unit_after
 
 RESOLVED = 2.0  # standard deviations by which a value differs from zero, to be proposed
@@ -38,7 +38,7 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     if fit.status != "converged" and not _repeats(fit):
         errors.insert(0, (fit.message, ""))
     reasons = tuple(_group(errors))
-    again = [f"correct the file, then type {commands.fit}"] if commands.fit else []
+    again = [Step.typed("correct the file, then", commands.fit)] if commands.fit else []
     return Verdict(
         met=False,
         text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met{_name_silent(fit)}",
@@ -240,7 +240,7 @@ def _group(pairs: Iterable[tuple[str, str]]) -> Iterator[Reason]:
         yield Reason(what=what, where=text, count=1 + len(named[MOST_PLACES:]))
 
 
-def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[str]:
+def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[Step]:
     """Yield what to write for the likely cause that is named first, with the lines, place by place. What is not told
     from zero is not to be freed, nor how sharp friction is: a search for that takes long and ends nowhere. What comes
     with a part comes with its line, beside the parts that the plant has. `plants`: the parts of each table.
@@ -269,14 +269,14 @@ def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[str]:
         rows = ["sticks = true"] if cause.sticks else []
         rows += spell_parts((*parts, *added)) if added else []
         if rows:
-            yield _say_place(f"[plant.{name}]", rows)
+            yield _write_under(f"[plant.{name}]", rows)
     for place, lines in places.items():
         if lines:
-            yield _say_place(place, lines)
+            yield _write_under(place, lines)
 
 
-def _say_place(place: str, rows: Iterable[str]) -> str:
-    return "\n".join([f"write under {place}, in place of a line of that name if there is one:", *rows])
+def _write_under(place: str, rows: Iterable[str]) -> Step:
+    return Step(text=f"write under {place}, in place of a line of that name if there is one:", copied=tuple(rows))
 
 
 def spell_cure(name: str, value: float) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from seaopt.estimation import LogComparison, ModelledOutputs
 from seaopt.formatting import format_number
-from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict
+from seaopt.reporting.sections.data import Commands, Reason, Section, Step, Table, Verdict
 from seaopt.units import unit_after
 
 APART = 3.0  # standard deviations
@@ -42,7 +42,7 @@ def judge(result: ModelledOutputs | LogComparison, commands: Commands) -> Verdic
         met=False,
         text=f"{comparison.name}: {'its values agree, on a fit that is not met' if agrees else 'contradicts the fit'}",
         reasons=tuple(reasons),
-        next=(_advise(comparison),) if apart else (),
+        next=(Step(text=_advise(comparison)),) if apart else (),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from seaopt.control import ScheduledController
 from seaopt.control.laws.command import name_gain_units
 from seaopt.formatting import format_count, format_number
-from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met
+from seaopt.reporting.sections.data import Commands, Reason, Section, Step, Table, Verdict, list_notes, mark_met
 from seaopt.reporting.sections.kinds.controller import describe_surroundings
 from seaopt.units import unit_after
 
@@ -25,7 +25,7 @@ def judge(schedule: ScheduledController, commands: Commands) -> Verdict:
         met=False,
         text=f"{name}, {format_count(len(reasons), 'limit')} not met",
         reasons=reasons,
-        next=(schedule.remedy,),
+        next=(Step(text=schedule.remedy),),
     )
 
 
