@@ -10,7 +10,6 @@ Every bound is a theorem but for rounding, which is estimated at every step and 
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -61,12 +60,7 @@ class Budget:
         "Done when the bounds are within this fraction of the largest Ms and Mt measured.", default=0.01, above=0.0
     )
     boxes: int = option("Boxes after which to stop, for each plant.", default=1000, above=0)
-    seconds: float | None = option(
-        "The same in time, checked between blocks of boxes; the bounds then depend on the machine. None: boxes alone.",
-        default=60.0,
-        unit="s",
-        above=0.0,
-    )
+    arcs: int = option("Bounds of a box on an arc, S and T at once, after which to stop.", default=1_000_000, above=0)
 
     def __post_init__(self) -> None:
         check_options(self, ControlError)
@@ -144,6 +138,7 @@ class _BranchAndBound:
     stable: bool = True
     marginal: float | None = None  # where a law that changes has a loop that is stable but for rounding
     count: int = 0
+    bounded: int = 0  # arcs
     parameters: dict[str, float] = field(default_factory=dict[str, float])
 
 
@@ -186,14 +181,13 @@ def bracket(
     (True, True)
     """
     budget = budget or Budget()
-    end = np.inf if budget.seconds is None else time.perf_counter() + budget.seconds
     peaks = np.zeros(2) if worst is None else np.array([worst.ms, worst.mt])
     try:
         controller = close_terms(controller, plant)
         search = _start(
             controller, plant, unknown, budget.tolerance, peaks, 0.0 if worst is None else worst.severity, scheduled
         )
-        while search.arcs.box.size and search.count < budget.boxes and time.perf_counter() < end:
+        while search.arcs.box.size and search.count < budget.boxes and search.bounded < budget.arcs:
             if not np.all(np.isfinite(search.lower)) or (search.count and not search.within.size):
                 break  # a plant is unstable, or there is nothing to halve
             first, boxes = not search.count, search.boxes
@@ -351,7 +345,7 @@ def _bound_block(
     while arcs.box.size:
         block, arcs = take_rows(arcs, slice(0, ARC_BLOCK)), take_rows(arcs, slice(ARC_BLOCK, None))
         new = bound_arcs(search.law, sampled, boxes, search.within.ball, block)
-        block = block.tighten(new.s, new.t)
+        block, search.bounded = block.tighten(new.s, new.t), search.bounded + block.box.size
         if first:
             _measure(search, _worst_corners(search, boxes, block, new))
             first = False

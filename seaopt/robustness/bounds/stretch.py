@@ -24,7 +24,7 @@ from seaopt.robustness.uncertainty.batch import batch_figures
 from seaopt.robustness.uncertainty.draws import Column, combine_uncertainty
 from seaopt.robustness.uncertainty.severity import find_failures, limits
 
-BUDGET = Budget(tolerance=0.02, boxes=400, seconds=None)
+BUDGET = Budget(tolerance=0.02, boxes=400)
 PLACE = "schedule_place"  # a parameter, of a plant without the variable
 
 

@@ -261,7 +261,18 @@ def test_figures_are_rounded_up():
     assert bounds.statement == "bounded, rounding estimated: all stable, Ms below 1.545, Mt below 12.35"
 
 
-@pytest.mark.parametrize("wrong", [{"tolerance": 0.0}, {"boxes": 0}, {"seconds": -1.0}])
+def test_a_search_ends_by_what_it_has_bounded_and_what_it_has_by_then_holds(controller, thor):
+    """A slow machine and a fast one end at the same: no clock is asked."""
+    swing = so.plants.moving_output()
+    unknown = of(swing, thor.prior(J=3.3e-8, b_r=2e-6, eta=0.01), {"I_p": (0.3, 0.5)})
+    figures = batch_figures(controller, swing, unknown.nominal, unknown.values(draws(unknown, 200)))
+    first, last = (bracket(controller, swing, unknown, None, Budget(arcs=arcs)) for arcs in (1, 1_000_000))
+    assert first.boxes < last.boxes
+    assert not np.isfinite(first.ms_upper) or first.ms_upper >= last.ms_upper
+    assert last.bounded_stable and np.max(figures.ms) <= last.ms_upper
+
+
+@pytest.mark.parametrize("wrong", [{"tolerance": 0.0}, {"boxes": 0}, {"arcs": 0}])
 def test_bad_budgets(wrong):
     with pytest.raises(ControlError, match="is not above 0"):
         Budget(**wrong)
@@ -289,7 +300,7 @@ def test_a_range_of_no_width_is_that_value(eta, controller, stand, thor):
     ranges = {"m_l": (0.5, 0.7)}
     pinned = combine_uncertainty(thor, so.ParameterSet(), ranges | {"eta": (eta, eta)}, {"stand": stand})
     updated = combine_uncertainty(thor.update(eta=eta), so.ParameterSet(), ranges, {"stand": stand})
-    budget = Budget(boxes=50, seconds=20.0)
+    budget = Budget(boxes=50)
     bounds, expected = (bracket(controller, stand, unknown, None, budget) for unknown in (pinned, updated))
     assert bounds.bounded_stable
     assert bounds.ms_upper == pytest.approx(expected.ms_upper, rel=1e-9)
