@@ -144,11 +144,9 @@ class Products:
 
     def sensitivity(self, z: Curves) -> Curves:
         """Return S of each row at that row's points."""
-        above, below = np.ones_like(z), np.ones_like(z)
-        for k in range(self.opened.shape[1]):
-            above *= z - self.opened[:, k, None]
-            below *= z - self.closed[:, k, None]
-        return above / below * self.scale[:, None]
+        above, below = (_multiply_factors(z, poles) for poles in (self.opened, self.closed))
+        above /= below
+        return above * self.scale[:, None]
 
     def logarithmic(self, z: Curves) -> tuple[Curves, Curves]:
         """Return S'/S and its derivative."""
@@ -158,6 +156,15 @@ class Products:
             first += above - below
             second += below**2 - above**2
         return first, second
+
+
+def _multiply_factors(z: Curves, poles: Complex[np.ndarray, "n k"]) -> Curves:
+    """Return the product of z - p over each row's poles p; one array takes all factors, for memory is slow."""
+    out = z - poles[:, :1]
+    factor = np.empty_like(out)
+    for k in range(1, poles.shape[1]):
+        out *= np.subtract(z, poles[:, k, None], out=factor)
+    return out
 
 
 def _close_piece(
@@ -205,9 +212,11 @@ def find_peaks(loop: Products, by: Levels) -> tuple[Peaks, Peaks]:
     near_poles = np.where(upper, angle[:, :, None] + distance[:, :, None] * FAN, 0.0).reshape(angle.shape[0], -1)
     base = np.broadcast_to(BASE_ANGLES, (angle.shape[0], BASE_ANGLES.size))
     theta = np.sort(np.clip(np.concatenate([base, near_poles], axis=1), 0.0, np.pi), axis=1)
-    s = loop.sensitivity(np.exp(1j * theta))
+    theta = theta[:, np.argmax(np.any(theta > 0.0, axis=0)) - 1 :]  # each row begins with one 0, or with some
+    z = np.exp(1j * theta)
+    s = loop.sensitivity(z)
     values = np.concatenate([np.abs(s), np.abs(1.0 - s)])
-    even = np.sin(theta) < SAME_ANGLE  # a curve at 0 and at half the rate: the grid has the value
+    even = z.imag < SAME_ANGLE  # a curve at 0 and at half the rate: the grid has the value
     counts = np.isfinite(by.T.reshape(-1, 1)) & ~np.concatenate([even, even])
     rows, points = _list_maxima(values, counts)
     at, count = rows % len(theta), len(theta)
@@ -216,7 +225,8 @@ def find_peaks(loop: Products, by: Levels) -> tuple[Peaks, Peaks]:
     every = np.arange(len(values))
     first = np.argmax(values, axis=1)
     top, where = values[every, first], theta[every % count, first]
-    rising = [k for k in np.argsort(refined) if refined[k] > top[rows[k]]]  # the last of a row is its highest
+    rising = np.argsort(refined)
+    rising = rising[refined[rising] > top[rows[rising]]]  # the last of a row is its highest
     top[rows[rising]], where[rows[rising]] = refined[rising], angles[rising]
     return (top[:count], where[:count]), (top[count:], where[count:])
 
@@ -245,9 +255,12 @@ def _find_neighbours(theta: Float[np.ndarray, "n m"], point: Int[np.ndarray, " n
     """Return the neighbours of a grid point that do not coincide with it."""
     rows, last = np.arange(point.size), theta.shape[1] - 1
     centre = theta[rows, point]
-    low = np.max(np.where(theta < centre[:, None] - SAME_ANGLE, theta, 0.0), axis=1)
-    high = np.min(np.where(theta > centre[:, None] + SAME_ANGLE, theta, np.pi), axis=1)
-    return low, np.where(point < last, high, centre)
+    below, above = np.maximum(point - 1, 0), np.minimum(point + 1, last)
+    while (same := (theta[rows, below] >= centre - SAME_ANGLE) & (below > 0)).any():
+        below = below - same
+    while (same := (theta[rows, above] <= centre + SAME_ANGLE) & (above < last)).any():
+        above = above + same
+    return theta[rows, below], theta[rows, above]
 
 
 def _refine_peaks(loop: Products, low: Column, x: Column, high: Column, complement: Bool[np.ndarray, " n"]) -> Peaks:
