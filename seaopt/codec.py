@@ -109,23 +109,23 @@ def read_fields(cls: type[Any], content: Any, source: str, *, remedy: str) -> di
     return _take_fields(cls, check_table(make_model(cls), plain(content), source, remedy=remedy))
 
 
-def check_agrees(content: Any, own: Any, source: str, *, remedy: str, place: str = "", rtol: float = EXACT) -> None:
-    """Refuse a file of which a key is not what `own`, `to_content` of the record made of it, has; absent keys are not
-    asked for, as an older file may have fewer. `source`, `remedy`, `place`: for the message. `rtol`: relative
+def check_agrees(content: Any, made: Any, source: str, *, remedy: str, path: str = "", rtol: float = EXACT) -> None:
+    """Refuse a file of which a key is not what `made`, `to_content` of the record made of it, has; absent keys are not
+    asked for, as an older file may have fewer. `source`, `remedy`, `path`: for the message. `rtol`: relative
     difference that two numbers may have. Raises FileError, with the first key that differs.
     """
     from seaopt.documents import shorten
 
-    if isinstance(own, Mapping) and isinstance(content, Mapping):
-        for key in own:
+    if isinstance(made, Mapping) and isinstance(content, Mapping):
+        for key in made:
             if key in content:
-                inner = f"{place}.{key}".lstrip(".")
-                check_agrees(content[key], own[key], source, remedy=remedy, place=inner, rtol=rtol)
+                inner = f"{path}.{key}".lstrip(".")
+                check_agrees(content[key], made[key], source, remedy=remedy, path=inner, rtol=rtol)
         return
-    content, own = plain(content), plain(own)
-    if not _agree(content, own, rtol):
-        found, made = shorten(content), shorten(own)
-        raise FileError(f"{source}: {place} is {found}, and the other keys make {made}; {remedy}")
+    content, made = plain(content), plain(made)
+    if not _agree(content, made, rtol):
+        found, expected = shorten(content), shorten(made)
+        raise FileError(f"{source}: {path} is {found}, and the other keys make {expected}; {remedy}")
 
 
 def _agree(a: Any, b: Any, rtol: float) -> bool:
@@ -172,15 +172,15 @@ def make_model(cls: type[Any]) -> type[BaseModel]:
 
     from seaopt.documents import ResultTable
 
-    hints, known = get_type_hints(cls, include_extras=True), {field.name: field for field in fields(cls)}
+    hints, attributes = get_type_hints(cls, include_extras=True), {field.name: field for field in fields(cls)}
     definitions: dict[str, Any] = {}
     for key in list_keys(cls):
-        if key.field in known:
-            default = _state_default(known[key.field])
+        if key.field in attributes:
+            default = _state_default(attributes[key.field])
             definitions[key.field] = (_translate(hints[key.field]), ModelField(alias=key.name, **default))
         else:
-            held = get_type_hints(getattr(cls, key.field).fget, include_extras=True)["return"]
-            definitions[key.field] = (_translate(held), ModelField(alias=key.name, default=None))
+            hint = get_type_hints(getattr(cls, key.field).fget, include_extras=True)["return"]
+            definitions[key.field] = (_translate(hint), ModelField(alias=key.name, default=None))
     summary = (cls.__doc__ or cls.__name__).strip().split("\n\n")[0].replace("\n", " ")
     return create_model(f"Stored{cls.__name__}", __base__=ResultTable, __doc__=summary, **definitions)
 
@@ -192,8 +192,8 @@ def _state_default(field: Field[Any]) -> dict[str, Any]:
 
 
 def _take_fields(cls: type[Any], model: BaseModel) -> dict[str, Any]:
-    known = {field.name for field in fields(cls)}
-    return {key.field: getattr(model, key.field) for key in list_keys(cls) if key.field in known}
+    names = {field.name for field in fields(cls)}
+    return {key.field: getattr(model, key.field) for key in list_keys(cls) if key.field in names}
 
 
 def _translate(hint: Any) -> Any:
@@ -218,9 +218,9 @@ def _translate(hint: Any) -> Any:
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
         return _translate_array(hint, Flag if "bool" in hint.dtypes else Number)
     if hasattr(hint, "_from_json"):
-        held = get_type_hints(hint._from_json, include_extras=True)["content"]
-        held = Annotated[held, Fields(of=hint)] if held == Mapping[str, Any] else held
-        return Annotated[_translate(held), AfterValidator(_explain(hint._from_json))]
+        content = get_type_hints(hint._from_json, include_extras=True)["content"]
+        content = Annotated[content, Fields(of=hint)] if content == Mapping[str, Any] else content
+        return Annotated[_translate(content), AfterValidator(_explain(hint._from_json))]
     if is_dataclass(hint):
         cls = cast(type[Any], hint)
         return Annotated[make_model(cls), AfterValidator(_explain(lambda model: cls(**_take_fields(cls, model))))]

@@ -162,7 +162,7 @@ def document_options(record: type[Any]) -> str:
         text = re.sub(r"^[a-z](?=[a-z]+ )", lambda first: first[0].upper(), text)
         lines.append(f"{entry.name} : {', '.join(part for part in kind if part)}")
         lines += textwrap.wrap(text, WIDTH, initial_indent=INDENT, subsequent_indent=INDENT)
-    head, *others = re.split(r"(?m)^(?=\s*(?:Raises|Examples|Notes)\n\s*-{3})", record.__doc__ or "", maxsplit=1)
-    others = [INDENT + text.lstrip() for text in others] or [INDENT]
+    head, *sections = re.split(r"(?m)^(?=\s*(?:Raises|Examples|Notes)\n\s*-{3})", record.__doc__ or "", maxsplit=1)
+    sections = [INDENT + text.lstrip() for text in sections] or [INDENT]
     section = textwrap.indent("\n".join(lines), INDENT)
-    return "\n\n".join([head.rstrip(), section, *others])
+    return "\n\n".join([head.rstrip(), section, *sections])

@@ -170,7 +170,7 @@ class Mechanics:
 
     word: str
     unit: str
-    place: str
+    position: str
     inertia_word: str
     inertias: str
     inertia: str
@@ -178,12 +178,12 @@ class Mechanics:
     @property
     def stiffness(self) -> str:
         """The unit of effort over place."""
-        return f"{self.unit}/{self.place}"
+        return f"{self.unit}/{self.position}"
 
     @property
     def damping(self) -> str:
         """The unit of effort over speed."""
-        return f"{self.unit} s/{self.place}"
+        return f"{self.unit} s/{self.position}"
 
     @property
     def impulse(self) -> str:
@@ -196,12 +196,12 @@ class Mechanics:
         return divide_units(self.unit, self.unit)
 
 
-LINEAR = Mechanics(word="force", unit="N", place="m", inertia_word="mass", inertias="masses", inertia="kg")
+LINEAR = Mechanics(word="force", unit="N", position="m", inertia_word="mass", inertias="masses", inertia="kg")
 ROTARY = Mechanics(
-    word="torque", unit="N m", place="rad", inertia_word="inertia", inertias="inertias", inertia="kg m^2"
+    word="torque", unit="N m", position="rad", inertia_word="inertia", inertias="inertias", inertia="kg m^2"
 )
 
 
 def mechanics_of(unit: str) -> Mechanics:
     """Return how quantities are called where efforts, or places, have a unit: N or m, N m or rad."""
-    return ROTARY if unit in (ROTARY.unit, ROTARY.place) else LINEAR
+    return ROTARY if unit in (ROTARY.unit, ROTARY.position) else LINEAR

@@ -108,10 +108,10 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
             )
             raise LogError(f"{error}; type {command}") from error
         table = read(time=Column(column=error.column, unit=error.unit))
-        others = {"s": ("ms", "milliseconds")}.get(error.unit, ("s", "seconds"))
+        unit, word = {"s": ("ms", "milliseconds")}.get(error.unit, ("s", "seconds"))
         note = (
-            f'column "{error.column}" has no unit: {error.unit} was assumed, by the size of its steps; for {others[1]} '
-            f"type {_spell_clock(path, error.column, others[0])}"
+            f'column "{error.column}" has no unit: {error.unit} was assumed, by the size of its steps; for {word} '
+            f"type {_spell_clock(path, error.column, unit)}"
         )
         return replace(table, notes=(note, *table.notes))
 
@@ -177,11 +177,11 @@ def parse_pairs(option: str, texts: Sequence[str]) -> dict[str, str]:
 
 def _print_report(quality: Quality, written: list[Path], amount: Amount) -> None:
     """Print the verdict, and with it findings and channels unless asked for little."""
-    console, first, *others = Terminal(), *describe(quality)
+    console, first, *further = Terminal(), *describe(quality)
     if amount == "quiet":
         console.write(render_sections([Section(title=first.title)], console.width)[1:])
         return
     most = Most() if amount == "verbose" else Most(rows=MOST_LINES, items=MOST_LINES)
-    console.write(render_sections([first, *others], console.width, most)[1:])
+    console.write(render_sections([first, *further], console.width, most)[1:])
     if written:
         console.list_files(written)

@@ -363,11 +363,11 @@ class Session:
         """Return the fit of the problem with what explains its logs, which is the problem from here on."""
         self.problem, lines = adopt(self.problem, found)
         self._experiments = None
-        place = self.folder / EXPLAINED
-        write_text(place, lines + "\n")
-        self.written.append(place)
+        path = self.folder / EXPLAINED
+        write_text(path, lines + "\n")
+        self.written.append(path)
         self.say(
-            f"{say_adopted(found)}; fitting again with the lines in {place}, which belong into {self.problem.source}"
+            f"{say_adopted(found)}; fitting again with the lines in {path}, which belong into {self.problem.source}"
         )
         result = fit_problem(self.problem, self.experiments(), keep=self._keep_fit, progress=tell)
         return replace(result, hypotheses=(*before.hypotheses, *result.hypotheses))

@@ -113,10 +113,10 @@ def read_manifest(path: Path | str, column: str = "log") -> tuple[FleetLog, ...]
         name = row.pop(column)
         if not name:
             raise LogError(f"{source}: line {number} names no log; fill it in, or delete the line")
-        place = name if _ADDRESS.match(name) else _absolute(source.parent / name)
-        if place in logs:
+        log_path = name if _ADDRESS.match(name) else _absolute(source.parent / name)
+        if log_path in logs:
             raise LogError(f"{source}: lists {name} twice; delete one of the lines")
-        logs[place] = FleetLog(path=place, identity={key: value or "" for key, value in row.items()})
+        logs[log_path] = FleetLog(path=log_path, identity={key: value or "" for key, value in row.items()})
     if not logs:
         raise LogError(f"{source}: lists no logs")
     return tuple(logs.values())

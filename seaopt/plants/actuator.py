@@ -94,14 +94,14 @@ def _nothing(x: Any, p: Any) -> Any:
 
 @record(eq=False)
 class Link:
-    """One link: its coordinate and rate (states, if it moves), place along the axis, energies, force of its damper.
+    """One link: its coordinate and rate (states, if it moves), position along the axis, energies, force of its damper.
 
     `unit` is the coordinate's, `effort` the input that pushes it along the axis, `parameters` are its own.
     """
 
     coordinate: str | None = None
     rate: str | None = None
-    place: StateExpression = _nothing
+    position: StateExpression = _nothing
     kinetic: StateExpression = _nothing
     potential: StateExpression = _nothing
     damping: StateExpression = _nothing
@@ -193,7 +193,7 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> EquationsOfMotio
     sigma, travel, inertia = drive.direction, drive.travel(p) * y[0], drive.inertia(p)
     sprung = drive.sprung(p) if unlumped else drive.sprung(p) + inertia / drive.travel(p) ** 2
     stretch = x.s if screw else 0.0
-    x_1, x_2 = (link.place(x, p) for link in links)
+    x_1, x_2 = (link.position(x, p) for link in links)
     if actuator.spring == "link1":
         x_n = x_2 + stretch  # the nut
         x_s = x_h = x_n - sigma * travel
@@ -230,8 +230,8 @@ def solve_motion(actuator: Actuator, x: Any, u: Any, p: Any) -> EquationsOfMotio
     # Along the positions' gradients, not the gradient of a work: a force may depend on the state (a spring outside).
     external = sum(
         (
-            getattr(u, link.effort, 0.0) * ca.gradient(place, y)
-            for link, place in zip(links, (x_1, x_2), strict=True)
+            getattr(u, link.effort, 0.0) * ca.gradient(position, y)
+            for link, position in zip(links, (x_1, x_2), strict=True)
             if link.effort is not None
         ),
         ca.SX(y.numel(), 1),
@@ -295,9 +295,9 @@ def make_plant(
     which a log may leave out.
     """
     drive, parts = actuator.transmission, actuator.parts
-    place, effort = drive.place_unit, drive.effort_unit
-    pairs = [(drive.coordinate, drive.rate, place)]
-    pairs += [("s", "sd", place)] if "screw_mode" in parts else []
+    position, effort = drive.place_unit, drive.effort_unit
+    pairs = [(drive.coordinate, drive.rate, position)]
+    pairs += [("s", "sd", position)] if "screw_mode" in parts else []
     pairs += [(str(link.coordinate), str(link.rate), link.unit) for link in actuator.links if link.moves]
     parameters = [*drive.parameters, *part_laws.parameters(parts, drive.part_parameters)]
     parameters += [parameter for link in actuator.links for parameter in link.parameters]
@@ -325,7 +325,7 @@ def make_plant(
 
     plant = Plant(
         name=name,
-        states=states | {_get_bristles(friction).state: place for friction in bristled},
+        states=states | {_get_bristles(friction).state: position for friction in bristled},
         inputs={"I": "A"} | dict.fromkeys(inputs, effort),
         outputs={output: unit for output, (unit, _) in outputs.items()},
         parameters={parameter.name: parameter for parameter in parameters},
@@ -344,7 +344,7 @@ def make_plant(
         sensing=sensing,
         spring=SeriesSpring(
             deflection=deflection,
-            unit=place,
+            unit=position,
             stiffness=drive.stiffness,
             pull=lambda x, p: _find_pull(actuator, x, p),
             mass=second_order[0] if second_order else None,

@@ -99,7 +99,7 @@ def _make_link(kind: LinkKind, number: int, suffix: str) -> Link:
             coordinate=coordinate,
             rate=rate,
             unit="m",
-            place=lambda x, p: getattr(x, coordinate),
+            position=lambda x, p: getattr(x, coordinate),
             kinetic=lambda x, p: 0.5 * getattr(p, mass) * getattr(x, rate) ** 2,
             effort=f"Fe{number}",
             parameters=(link_mass(number),),
@@ -113,7 +113,7 @@ def _make_link(kind: LinkKind, number: int, suffix: str) -> Link:
         coordinate=phi,
         rate=phid,
         unit="rad",
-        place=lambda x, p: read(p, "L_a") * ca.sin(getattr(x, phi)),
+        position=lambda x, p: read(p, "L_a") * ca.sin(getattr(x, phi)),
         kinetic=lambda x, p: 0.5 * read(p, "I_p") * getattr(x, phid) ** 2,
         potential=lambda x, p: read(p, "m") * p.g * read(p, "L") * (1 - ca.cos(getattr(x, phi))),
         damping=lambda x, p: read(p, "d") * getattr(x, phid),
@@ -179,14 +179,14 @@ def _list_outputs(build: _Build) -> dict[str, tuple[str, Any]]:
     def angle(name: str) -> Any:
         return lambda motion, x: getattr(x, name)
 
-    def place(index: int) -> Any:
+    def position(index: int) -> Any:
         return lambda motion, x: motion.places[index]
 
     for index, (link, suffix) in enumerate(zip(build.links, build.suffixes, strict=True)):
         if link == "pendulum":
             outputs[f"phi{suffix}"] = ("rad", angle(f"phi{suffix}"))
         if link != "fixed":
-            outputs[f"x_{index + 1}"] = ("m", place(index))
+            outputs[f"x_{index + 1}"] = ("m", position(index))
     return outputs
 
 

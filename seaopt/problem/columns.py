@@ -20,12 +20,12 @@ def list_log_files(table: ExperimentTable) -> list[str]:
     return list(dict.fromkeys([*logs, *named]))
 
 
-def check_inside(place: str, table: ExperimentTable) -> None:
+def check_inside(key: str, table: ExperimentTable) -> None:
     """Refuse a file outside the problem file's folder. Raises ProblemError: a path is absolute, or climbs out."""
     for name in list_log_files(table):
         for kind in (PurePosixPath, PureWindowsPath):  # a problem file reads the same on every system
             if kind(name).anchor or ".." in kind(name).parts:
-                raise ProblemError(f'{place}.log = "{name}" leaves the problem file\'s folder; put the log beside it')
+                raise ProblemError(f'{key}.log = "{name}" leaves the problem file\'s folder; put the log beside it')
 
 
 def check_links(folder: Path, names: list[str]) -> None:

@@ -31,7 +31,7 @@ KINDS = {
     "definitions": "a definition",
 }  # fmt: skip
 FRICTION_FORMULAS = ("velocity", "force", "effort", "slopes", "jump", "loads")
-Read = Callable[[str, Formula], Any]  # returns the expression of a formula, given its place
+Read = Callable[[str, Formula], Any]  # returns the expression of a formula, given its key
 
 
 def order_plants(tables: Mapping[str, AnyPlant]) -> list[str]:
@@ -41,8 +41,8 @@ def order_plants(tables: Mapping[str, AnyPlant]) -> list[str]:
     named = {name: set(list_partners(table)) for name, table in tables.items()}
     for name, partners in named.items():
         for partner in sorted(partners - tables.keys()):
-            known = suggestion(partner, tables)
-            raise PlantError(f'plant.{name}: ports names "{partner}", which is not a [plant] of this file; {known}')
+            remedy = suggestion(partner, tables)
+            raise PlantError(f'plant.{name}: ports names "{partner}", which is not a [plant] of this file; {remedy}')
     return _sort(named, "plants hold or probe each other")
 
 
@@ -54,7 +54,7 @@ def list_partners(table: AnyPlant) -> list[str]:
 
 def make_plant(name: str, table: EquationsTable, partners: Mapping[str, Plant]) -> Plant:
     """Return the plant of a table. `name`: of the plant. `partners`: the plants that its ports name. Raises PlantError:
-    a name, an equation or a role is not as it must be; the message names the place. Raises UnitError: a unit is
+    a name, an equation or a role is not as it must be; the message names the key. Raises UnitError: a unit is
     unknown, or not SI.
     """
     _check_names(table)
@@ -148,29 +148,31 @@ class _Texts:
             symbols: dict[str, Any] = {}
             for names, argument in zip(arguments, given, strict=True):
                 symbols |= {names: argument} if isinstance(names, str) else vars(argument)
-            known = {name: symbol for name, symbol in symbols.items() if name != VELOCITY or VELOCITY not in arguments}
+            defined = {
+                name: symbol for name, symbol in symbols.items() if name != VELOCITY or VELOCITY not in arguments
+            }
 
-            def read(place: str, text: Formula) -> Any:
-                self.define(known, text)
-                return self.read(place, text, known | symbols)
+            def read(key: str, text: Formula) -> Any:
+                self.define(defined, text)
+                return self.read(key, text, defined | symbols)
 
             return write(read)
 
         return store_function(function, *arguments)
 
-    def define(self, known: dict[str, Any], text: Formula) -> None:
-        """Add the definitions that a formula needs to what is known, if they use nothing else of the plant."""
+    def define(self, defined: dict[str, Any], text: Formula) -> None:
+        """Add the definitions that a formula needs to what is defined, if they use nothing else of the plant."""
         needed = set(list_names(str(text)))
         for name in reversed(self.definitions):
             if name in needed:
                 needed |= set(list_names(str(self.table.definitions[name])))
         for name in self.definitions:
-            if name in needed and name not in known:
-                own = self.names.keys() & set(list_names(str(self.table.definitions[name]))) - RESERVED
-                if own <= known.keys():
-                    known[name] = self.read(f"definitions.{name}", self.table.definitions[name], known)
+            if name in needed and name not in defined:
+                uses = self.names.keys() & set(list_names(str(self.table.definitions[name]))) - RESERVED
+                if uses <= defined.keys():
+                    defined[name] = self.read(f"definitions.{name}", self.table.definitions[name], defined)
 
-    def read(self, place: str, text: Formula, symbols: Mapping[str, Any]) -> Any:
+    def read(self, key: str, text: Formula, symbols: Mapping[str, Any]) -> Any:
         """Return the expression of a formula in which these names may stand."""
         if not isinstance(text, str):
             return ca.SX(float(text))
@@ -181,7 +183,7 @@ class _Texts:
                 return "is an output; write its expression, or make it one of definitions"
             return None if kind is None else f"is {kind}, which may not stand here; known: {', '.join(symbols)}"
 
-        return parse(text, symbols, place, explain)
+        return parse(text, symbols, key, explain)
 
     def derive(self) -> StoredFunction | None:
         """Return the function of the derived figures."""
@@ -192,7 +194,7 @@ class _Texts:
 
         return self.store(write, self.parameters) if figures else None
 
-    def take(self, place: str, value: Any, takes: str, loads: Iterable[str] = ()) -> StoredFunction | None:
+    def take(self, key: str, value: Any, takes: str, loads: Iterable[str] = ()) -> StoredFunction | None:
         """Return a formula, or several in a list or a table, as a function of what it `takes`: the letters of
         `ARGUMENTS`. None where there is none.
         """
@@ -201,28 +203,28 @@ class _Texts:
 
         def write(read: Read) -> Any:
             if isinstance(value, Mapping):
-                return {name: read(f"{place}.{name}", text) for name, text in value.items()}
-            return tuple(read(place, text) for text in value) if isinstance(value, tuple) else read(place, value)
+                return {name: read(f"{key}.{name}", text) for name, text in value.items()}
+            return tuple(read(key, text) for text in value) if isinstance(value, tuple) else read(key, value)
 
         none = value is None or value == {}
         return None if none else self.store(write, *(spaces[letter] for letter in takes))
 
-    def make(self, kind: Any, place: str, role: StrictTable | None, *formulas: str, **others: Any) -> Any:
+    def make(self, kind: Any, key: str, role: StrictTable | None, *formulas: str, **makers: Any) -> Any:
         """Return a role of a table whose keys are its fields, some of them formulas; None where there is no table."""
         if role is None:
             return None
         fields = {name: tuple(value) if isinstance(value, list) else value for name, value in role}
         loads = fields.get("loads") or ()
-        functions = {name: self.take(f"{place}.{name}", fields[name], ARGUMENTS[name], loads) for name in formulas}
-        return kind(**fields | functions | others)
+        functions = {name: self.take(f"{key}.{name}", fields[name], ARGUMENTS[name], loads) for name in formulas}
+        return kind(**fields | functions | makers)
 
-    def port(self, place: str, role: PortTable, partners: Mapping[str, Plant]) -> Port:
+    def port(self, key: str, role: PortTable, partners: Mapping[str, Plant]) -> Port:
         """Return a port; the plants that it names are made already."""
         makers = {
-            key: None if name is None else lambda name=name: partners[name]
-            for key, name in (("held", role.held), ("probe", role.probe))
+            field: None if name is None else lambda name=name: partners[name]
+            for field, name in (("held", role.held), ("probe", role.probe))
         }
-        return self.make(Port, place, role, "ratio", **makers)
+        return self.make(Port, key, role, "ratio", **makers)
 
 
 def _list_kinds(table: EquationsTable) -> dict[str, str]:
@@ -255,7 +257,7 @@ def _sort(uses: Mapping[str, Iterable[str]], what: str) -> list[str]:
 
 
 def _check_names(table: EquationsTable) -> None:
-    # A text that is too long by itself is refused where it is read, with its place.
+    # A text that is too long by itself is refused where it is read, with its key.
     characters = sum(min(len(text), MAX_LENGTH) for text in _list_texts(table.model_dump()))
     for what, count, most in (
         ("characters of text", characters, MAX_TEXT),
@@ -268,18 +270,18 @@ def _check_names(table: EquationsTable) -> None:
     seen: dict[str, str] = {}
     for group in KINDS:
         for name in getattr(table, group):
-            place = f"{group}.{name}"
+            key = f"{group}.{name}"
             if not name.isidentifier():
                 raise PlantError(f'{group}: "{name}" is not a name; use letters, digits and _')
             if name in RESERVED or name == TIME:
                 what = "the time" if name == TIME else "a function or constant"
-                raise PlantError(f"{place} has the name of {what} of the equations; rename it")
+                raise PlantError(f"{key} has the name of {what} of the equations; rename it")
             if any(name in (role.loads or ()) for role in table.friction.values()):
-                raise PlantError(f"{place} has the name of a friction's load; rename one")
+                raise PlantError(f"{key} has the name of a friction's load; rename one")
             if name == VELOCITY and table.friction and group in ("parameters", "definitions"):
-                raise PlantError(f"{place} has the name of the velocity in a friction's force and jump; rename it")
+                raise PlantError(f"{key} has the name of the velocity in a friction's force and jump; rename it")
             if name in seen:
-                raise PlantError(f"{place} is also one of {seen[name]}; rename one")
+                raise PlantError(f"{key} is also one of {seen[name]}; rename one")
             seen[name] = group
 
 
@@ -295,14 +297,14 @@ def _check_units(table: EquationsTable) -> None:
     roles = {"actuation": table.actuation, "spring": table.spring}
     roles |= {f"friction.{name}": curve for name, curve in table.friction.items()}
     roles |= {f"derived.{name}": figure for name, figure in table.derived.items()}
-    units |= {f"{place}.unit": role.unit for place, role in roles.items() if role is not None}
-    for place, unit in units.items():
+    units |= {f"{key}.unit": role.unit for key, role in roles.items() if role is not None}
+    for key, unit in units.items():
         try:
             same = factor(unit, si_unit(unit)) == 1.0
         except UnitError as error:
-            raise UnitError(f"{place}: {error}") from error
+            raise UnitError(f"{key}: {error}") from error
         if not same:
-            raise UnitError(f'{place} = "{unit}" is not an SI unit; write "{si_unit(unit)}", which equations are in')
+            raise UnitError(f'{key} = "{unit}" is not an SI unit; write "{si_unit(unit)}", which equations are in')
 
 
 def _check_equations(table: EquationsTable) -> None:

@@ -23,11 +23,11 @@ def make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Paramet
     """
     tables = table.parameters
     for experiment in table.experiment:
-        known = plants[experiment.plant].parameters if experiment.plant in plants else experiment.parameters
+        accepted = plants[experiment.plant].parameters if experiment.plant in plants else experiment.parameters
         for name in experiment.parameters:
-            if name not in known:
+            if name not in accepted:
                 raise ProblemError(
-                    f'experiment {experiment.name}: parameters names "{name}"; {suggestion(name, known)}'
+                    f'experiment {experiment.name}: parameters names "{name}"; {suggestion(name, accepted)}'
                 )
     # What each log states for itself need not be stated for all.
     of_logs = {key: _list_stated(table, key) for key in plants}
@@ -47,11 +47,11 @@ def make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Paramet
     _check_units(plants)
     _check_defaults(plants, {key: stated.union(tables) for key, stated in of_logs.items()})
     # A plant of the file may use a built-in plant's name for something else.
-    known = built_in | declared
-    parameters = {name: known[name] for name in known if name in declared or name in tables}
+    accepted = built_in | declared
+    parameters = {name: accepted[name] for name in accepted if name in declared or name in tables}
     for name, value in tables.items():
-        if name not in known:
-            remedy = suggestion(name, known)
+        if name not in accepted:
+            remedy = suggestion(name, accepted)
             if name.lower().replace("_", "") == "ke":
                 remedy = "a back-EMF constant in V s/rad is the torque constant in N m/A: give K_tau alone"
             raise ProblemError(f'parameters: unknown parameter "{name}"; {remedy}')
@@ -77,13 +77,13 @@ def _list_stated(table: ProblemTable, key: str) -> set[str]:
     return set[str].intersection(*stated) if stated else set()
 
 
-def _ask_for(key: str, plant: Plant, missing: Sequence[str], known: Mapping[str, Parameter]) -> str:
+def _ask_for(key: str, plant: Plant, missing: Sequence[str], described: Mapping[str, Parameter]) -> str:
     """Return what to say of parameters without a value or a default: what they are, in which unit, where they go."""
     words: list[str] = []
     for name in missing:
         unit = plant.parameter_unit(name)
-        same = name in known and known[name].unit == unit
-        about = [text for text in (known[name].description if same else "", unit_after(unit).strip()) if text]
+        same = name in described and described[name].unit == unit
+        about = [text for text in (described[name].description if same else "", unit_after(unit).strip()) if text]
         words.append(f"{name} ({', '.join(about)})" if about else name)
     example = ", ".join(f"{name} = ..." for name in missing)
     return (

@@ -31,26 +31,26 @@ RESPONSE = "frf:"  # before the name of an experiment whose frequency response i
 
 def check_references(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
     """Refuse names and ranges that the file's plants do not have (ProblemError, with the key)."""
-    places = [(f"experiment.{experiment.name}.plant", experiment.plant) for experiment in table.experiment]
+    keys = [(f"experiment.{experiment.name}.plant", experiment.plant) for experiment in table.experiment]
     if table.controller:
         _check_responses(table, table.controller)
         named = [("controller.plant", table.controller.plant)]
         named += [("controller.robust_to", name) for name in table.controller.robust_to]
-        places += [(place, name) for place, name in named if not name.startswith(RESPONSE)]
+        keys += [(key, name) for key, name in named if not name.startswith(RESPONSE)]
         gravity = table.controller.compensation.gravity
         if gravity is not None and gravity.plant is not None:
-            places.append(("controller.compensate.gravity.plant", gravity.plant))
+            keys.append(("controller.compensate.gravity.plant", gravity.plant))
     if table.impedance:
         if table.controller is None:
             raise ProblemError("[impedance] is there, and no [controller] is; add one, or leave it out")
-        places.append(("impedance.plant", table.impedance.plant))
-    places += [("robustness.plants", name) for name in table.robustness.plants] if table.robustness else []
-    for place, name in places:
+        keys.append(("impedance.plant", table.impedance.plant))
+    keys += [("robustness.plants", name) for name in table.robustness.plants] if table.robustness else []
+    for key, name in keys:
         if name not in plants:
-            key, near = place.rpartition(".")[2], _nearest(name, [*plants])
-            line = f'{key} = "{near}"' if key == "plant" else f'{key} = ["{near}"]'
+            near = _nearest(name, [*plants])
+            line = f'plant = "{near}"' if key.endswith(".plant") else f'{key.rpartition(".")[2]} = ["{near}"]'
             raise ProblemError(
-                f'{place} = "{name}" is not a [plant] of this file ({suggestion(name, plants)}); write {line}'
+                f'{key} = "{name}" is not a [plant] of this file ({suggestion(name, plants)}); write {line}'
             )
     _check_schedule(table, plants)
     _check_measured(table, plants)
@@ -109,10 +109,10 @@ def _check_responses(table: ProblemTable, controller: ControllerTable) -> None:
     """Refuse measured responses of experiments that the file has not, or that do not measure what is regulated."""
     experiments = {experiment.name: experiment for experiment in table.experiment}
     named = [("plant", controller.plant), *(("robust_to", name) for name in controller.robust_to)]
-    for place, name in named:
+    for field, name in named:
         if not name.startswith(RESPONSE):
             continue
-        key, source = f'controller.{place} = "{name}"', name.removeprefix(RESPONSE)
+        key, source = f'controller.{field} = "{name}"', name.removeprefix(RESPONSE)
         if source not in experiments:
             raise ProblemError(f"{key} is of no [[experiment]] of this file; {suggestion(source, experiments)}")
         experiment = experiments[source]
@@ -153,17 +153,17 @@ def _check_expected(
         _check_names(f"expect.fit_percent.{name}", limits if isinstance(limits, dict) else (), outputs)
 
 
-def _check_names(place: str, names: Iterable[str], known: Iterable[str]) -> None:
+def _check_names(key: str, names: Iterable[str], valid: Iterable[str]) -> None:
     for name in names:
-        if name not in known:
-            raise ProblemError(f'{place} names "{name}"; {suggestion(name, known)}')
+        if name not in valid:
+            raise ProblemError(f'{key} names "{name}"; {suggestion(name, valid)}')
 
 
 def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     controller = table.controller
     if controller is None:
         return
-    measured, *others = list_names(controller.measured)
+    measured, *signals = list_names(controller.measured)
     named: list[str] = [controller.plant, *controller.robust_to]
     named += table.robustness.plants if table.robustness else []
     named += [table.impedance.plant] if table.impedance else []
@@ -178,7 +178,7 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
                 f'{", ".join(outputs)}; write measured = "{_nearest(measured, outputs)}" in [controller]'
             )
         try:
-            find_signals(plant, tuple(others))
+            find_signals(plant, tuple(signals))
         except ControlError as error:
             raise ProblemError(f"controller.{error}") from error
 
@@ -191,9 +191,9 @@ def _check_link(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
         raise ProblemError(f'impedance.plant = "{table.impedance.plant}" holds its link; {remedy}')
 
 
-def _nearest(name: str, known: list[str]) -> str:
+def _nearest(name: str, names: list[str]) -> str:
     """Return the name that was likely meant, else the first of those that are there."""
-    return next(iter(get_close_matches(name, known, n=1, cutoff=0.6)), known[0] if known else "...")
+    return next(iter(get_close_matches(name, names, n=1, cutoff=0.6)), names[0] if names else "...")
 
 
 def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
@@ -206,64 +206,64 @@ def _check_sensors(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
 def _check_ranges(table: ProblemTable, plants: Mapping[str, Plant], parameters: ParameterSet) -> None:
     ranges = table.robustness.parameters if table.robustness else {}
     for name, ends in ranges.items():
-        place = f"robustness.parameters.{name}"
+        key = f"robustness.parameters.{name}"
         try:
             check_ranges({name: ends}, plants)
         except SeaoptError as error:
-            raise ProblemError(f"{place}: {error}") from error
-        place += f" = [{ends[0]:g}, {ends[1]:g}]"
+            raise ProblemError(f"{key}: {error}") from error
+        key += f" = [{ends[0]:g}, {ends[1]:g}]"
         bounds = parameters.get(name)
         if bounds is not None and (ends[0] < bounds.min or ends[1] > bounds.max):
             raise ProblemError(
-                f"{place}{unit_after(bounds.unit)} leaves the bounds [{bounds.min:g}, {bounds.max:g}] that this file "
+                f"{key}{unit_after(bounds.unit)} leaves the bounds [{bounds.min:g}, {bounds.max:g}] that this file "
                 f"gives {name}; keep inside, or change min and max: min = {min(ends[0], bounds.min):g}, "
                 f"max = {max(ends[1], bounds.max):g}"
             )
         if name in DELAYS and table.controller is not None:
-            _check_delay(place, ends[1], table.controller.sample_rate_hz)
+            _check_delay(key, ends[1], table.controller.sample_rate_hz)
     try:
         check_ranges(ranges, plants)
     except SeaoptError as error:
         raise ProblemError(f"robustness.parameters: {error}") from error
 
 
-def _check_delay(place: str, longest_s: float, rate_hz: float) -> None:
+def _check_delay(key: str, longest_s: float, rate_hz: float) -> None:
     """Refuse a delay of many samples: each is a state of every draw's plant, and takes its time."""
     if longest_s * rate_hz > MAX_LINK_DELAY_SAMPLES * (1.0 + 1e-9):
         raise ProblemError(
-            f"{place} s reaches {longest_s * rate_hz:.4g} sample times of controller.sample_rate_hz = {rate_hz:g}, and "
+            f"{key} s reaches {longest_s * rate_hz:.4g} sample times of controller.sample_rate_hz = {rate_hz:g}, and "
             f"takes at most {MAX_LINK_DELAY_SAMPLES} ({MAX_LINK_DELAY_SAMPLES / rate_hz:g} s); it is in seconds, and "
             f"a delay that is always there is controller.drive_delay_s = {longest_s:g}"
         )
 
 
 def _check_experiment(experiment: ExperimentTable, plant: Plant) -> None:
-    place = f"experiment.{experiment.name}"
+    key = f"experiment.{experiment.name}"
     if (experiment.log is None) == (experiment.virtual is None):
-        raise ProblemError(f'{place}: give either log or virtual, and not both: log = "NAME.csv"')
+        raise ProblemError(f'{key}: give either log or virtual, and not both: log = "NAME.csv"')
     if experiment.log is not None:
         driven = any(name not in plant.optional_inputs for name in plant.inputs)
         if not experiment.outputs or (driven and not experiment.inputs):
             first = experiment.log if isinstance(experiment.log, str) else next(iter(experiment.log), "LOG")
             raise ProblemError(
-                f"{place}: a log needs time, inputs and outputs; name their columns, as outputs = "
+                f"{key}: a log needs time, inputs and outputs; name their columns, as outputs = "
                 f'{{ NAME = "COLUMN" }} (seaopt inspect {shlex.quote(first)} --list lists them)'
             )
-        check_inside(place, experiment)
-    for kind, names, known in (
+        check_inside(key, experiment)
+    for kind, names, valid in (
         ("inputs", experiment.inputs, plant.inputs),
         ("outputs", experiment.outputs, {**plant.outputs, **experiment.differences}),
     ):
         for name in names:
-            if name not in known:
-                remedy = suggestion(name, known)
+            if name not in valid:
+                remedy = suggestion(name, valid)
                 if kind == "outputs" and read_header(name).quantity == "speed":
                     position = plant.sensing.motor_position if plant.sensing is not None else None
                     remedy += (
                         "; a speed that a device computed from a position is declared with differences = "
                         f'{{ {name} = {{ of = "{position or next(iter(plant.outputs))}" }} }}'
                     )
-                raise ProblemError(f'{place}.{kind} names "{name}"; {remedy}')
+                raise ProblemError(f'{key}.{kind} names "{name}"; {remedy}')
 
 
 def range_remarks(
@@ -274,12 +274,12 @@ def range_remarks(
     modes = find_modes(plants)
     angles = {name for plant in plants.values() for name, unit in plant.states.items() if unit == "rad"}
     for name, (low, high) in ranges.items():
-        place = f"robustness.parameters.{name} = [{low:g}, {high:g}]"
+        key = f"robustness.parameters.{name} = [{low:g}, {high:g}]"
         if name in modes and not _reaches_mode(name, (low, high), modes[name], plants, nominal):
-            remarks.append(f"{place} Hz leaves out the nominal mode, so that no draw is like the nominal plant")
+            remarks.append(f"{key} Hz leaves out the nominal mode, so that no draw is like the nominal plant")
         if name in angles and max(-low, high) > 0.5 * math.pi:
             ends = f"{math.degrees(low):.4g} to {math.degrees(high):.4g}"
-            remarks.append(f"{place} is in rad: {ends} degrees, beyond a right angle; keep it if that is meant")
+            remarks.append(f"{key} is in rad: {ends} degrees, beyond a right angle; keep it if that is meant")
     return remarks
 
 

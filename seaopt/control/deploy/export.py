@@ -345,7 +345,7 @@ def _write_numbers(
     stored: Controller, law: RunnableLaw | RunnableSchedule, number: Writer, precision: Precision
 ) -> dict[str, Any]:
     """Return what surrounds any law as text: what it reads, limits, guards, terms, outer loop."""
-    others = [strip_markup(name) for name in stored.signals[1:]]
+    readings = [strip_markup(name) for name in stored.signals[1:]]
     added = stored.compensation or Compensation(sample_time_s=law.sample_time_s)
     largest = float(LARGEST_NUMBER[precision])
     return {
@@ -357,7 +357,7 @@ def _write_numbers(
                 "argument": f"{name}_given",
                 "minus": f" - C_{name} {name}",
             }
-            for name in map(identifier, others)
+            for name in map(identifier, readings)
         ],
         "largest": number(LARGEST),
         "effort_limit": number(min(law.force_limit_N, largest)),
@@ -376,7 +376,7 @@ def _write_numbers(
         "further": [
             {"output": name, "symbol": f"read_{identifier(name)}", "used": name in added.reads}
             for name in law.further
-            if name not in others
+            if name not in readings
         ],
     }
 
@@ -392,7 +392,7 @@ def _numbers(stored: Controller, law: RunnableLaw, number: Writer) -> dict[str, 
     b, d, rest = (
         np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
     )
-    others = list(map(identifier, stored.signals[1:]))
+    readings = list(map(identifier, stored.signals[1:]))
     added = law.compensation or Compensation(sample_time_s=law.sample_time_s)
     at_rest = added.gravity, added.ripple if law.integrators else None  # without an integral no effort is set
     units = name_gain_units(stored.command)
@@ -411,7 +411,7 @@ def _numbers(stored: Controller, law: RunnableLaw, number: Writer) -> dict[str, 
         "rest_measurement": row(rest[0]),
         "columns_of": {
             name: {"b": row(b[i]), "d": number(float(d[i, 0])), "rest": row(rest[i])}
-            for i, name in enumerate(others, start=1)
+            for i, name in enumerate(readings, start=1)
         },
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),
         "gains": [
@@ -421,12 +421,12 @@ def _numbers(stored: Controller, law: RunnableLaw, number: Writer) -> dict[str, 
         "resets": [
             f"read_{identifier(name)}"
             for name in dict.fromkeys(term.reads for term in at_rest if term is not None)
-            if identifier(name) not in others
+            if identifier(name) not in readings
         ],
         "transfer_functions": [
             {"name": key, "num": row(tf.num), "den": row(tf.den)}
             for key, tf in zip(
-                ("reference", "measurement", *(f"measurement_{name}" for name in others)),
+                ("reference", "measurement", *(f"measurement_{name}" for name in readings)),
                 transfer_functions,
                 strict=True,
             )

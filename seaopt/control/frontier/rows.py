@@ -102,7 +102,7 @@ def make_row(
     *,
     without_sticking: SlidingAlone | None = None,
     free_law: FreeLaw | None = None,
-    place: float | None = None,
+    value: float | None = None,
 ) -> FrontierRow:
     """Return the row of a law, which was measured in these loops of a task."""
     design, f_b = loops[0].figures, task.spec.bandwidth_hz
@@ -113,7 +113,7 @@ def make_row(
         noise_gain=design.noise_gain,
         ms=worst.figures.ms,
         ms_plant=worst.name,
-        ms_place=place,
+        ms_place=value,
         disturbance=measure_disturbance(task, law),
         sensitivity_bandwidth_hz=design.sensitivity_bandwidth_hz,
         phase_margin_deg=design.phase_margin_deg,

@@ -76,7 +76,7 @@ class ScheduleSweep:
         """Return a row for each place of a schedule; with the best of all linear laws at its points."""
         rows: list[FrontierRow] = []
         responses = [(name, at) for name, at in self.robust_to.items() if isinstance(at, MeasuredResponse)]
-        for value in sorted((*schedule.points, *(place.value for place in schedule.between))):
+        for value in sorted((*schedule.points, *(point.value for point in schedule.between))):
             seen = {
                 name: response
                 for name, response in responses
@@ -96,7 +96,7 @@ class ScheduleSweep:
             if free_law and value in schedule.points and isinstance(task.plants[0], DigitalPlant):
                 free = bound_free_law(task.plants[0], spec, [law])
             loops = task.measure_law(law, filter_samples=0.0, integral_rad_s=0.0)
-            rows.append(make_row(task, law, loops, schedule.at(value), free_law=free, place=value))
+            rows.append(make_row(task, law, loops, schedule.at(value), free_law=free, value=value))
         return rows
 
 

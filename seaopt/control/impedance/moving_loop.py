@@ -68,10 +68,10 @@ def close_link(link: ControlledLink, velocity_filter_s: float, load: Load | None
     share = 1.0 / (1.0 + (load.inertia - port.mass) * port.force[port.speed])
     taken = -share * ((load.inertia - port.mass) * port.a[port.speed])
     taken[port.speed] -= share * load.damping
-    taken[port.place] -= share * load.stiffness
+    taken[port.position] -= share * load.stiffness
     pushed = -share * (load.inertia - port.mass) * port.motor[port.speed]
     a, b, c, d = port.load(taken, pushed)
-    rows, direct = np.vstack([c, np.eye(1, port.motor.size, k=port.place)]), np.append(d, 0.0)
+    rows, direct = np.vstack([c, np.eye(1, port.motor.size, k=port.position)]), np.append(d, 0.0)
     held = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
     a, b, c, d = (part[0] for part in held)
     plant, outer = make_plant(a, b, c, d, link.delay_samples), link.speed_filter(velocity_filter_s)

@@ -195,14 +195,14 @@ def name_rates(unit: str, measured: str, mechanics: Mechanics) -> dict[str, str]
         "k_d": divide_units(seconds, measured),
         "k_r": ratio,
         "k_ff": ratio,
-        "k_v": divide_units(seconds, mechanics.place),
+        "k_v": divide_units(seconds, mechanics.position),
     }
 
 
 def describe_cascade(gains: Mapping[str, float], command: Command) -> str:
     """Return the gains of a cascade as a drive with a speed loop is set: speeds per force error."""
     called = command.mechanics
-    units = name_rates(f"{called.place}/s", command.reference_unit, called)
+    units = name_rates(f"{called.position}/s", command.reference_unit, called)
     drive = ", ".join(
         f"{name} = {gains[name] / gains['k_v']:.5g} {units[name]}" for name in ("k_p", "k_i", "k_d", "k_r")
     )

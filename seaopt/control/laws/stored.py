@@ -269,7 +269,7 @@ def _check_gains(
     for name, (requested, has) in parts.items():
         asked = {} if requested is None else asdict(requested)
         numbers = {key: value for key, value in asked.items() if value is not None}
-        check_agrees(numbers, has, FILE, remedy=TUNE_AGAIN, place=f"spec.{name}", rtol=AGREES)
+        check_agrees(numbers, has, FILE, remedy=TUNE_AGAIN, path=f"spec.{name}", rtol=AGREES)
     if (observer is not None) != (spec.structure == "pid_dob") or (observer and gains["T_q"] != observer.T_q):
         raise _contradict("blocks.observer", "is not that of structure and gains")
     if not Gains.from_names(gains, observer, speed, link).makes(law, spec.structure):
@@ -300,14 +300,14 @@ def check_achieved(stated: Any, figures: Mapping[str, Any]) -> None:
     if not isinstance(stated, Mapping):
         raise FileError(f"{FILE}: achieved is missing or not a table; {TUNE_AGAIN}")
     stated = {name: stated.get(name) for name in figures}
-    check_agrees(stated, figures, FILE, remedy=TUNE_AGAIN, place="achieved", rtol=FIGURES_AGREE)
+    check_agrees(stated, figures, FILE, remedy=TUNE_AGAIN, path="achieved", rtol=FIGURES_AGREE)
 
 
 def check_friction_margin(stated: Any, margin: FrictionMargin | None) -> None:
     """Refuse a stated friction margin that the law does not have, to its precision; without friction any holds."""
     if stated is not None and margin is not None:
         figures, rtol = {"friction_margin": margin.least_slope}, 2.0 * MARGIN_PRECISION
-        check_agrees({"friction_margin": stated}, figures, FILE, remedy=TUNE_AGAIN, place="achieved", rtol=rtol)
+        check_agrees({"friction_margin": stated}, figures, FILE, remedy=TUNE_AGAIN, path="achieved", rtol=rtol)
 
 
 def _contradict(name: str, what: str) -> FileError:

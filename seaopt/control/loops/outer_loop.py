@@ -159,8 +159,8 @@ class OuterLoop:
 
     def ask(self, given: Any, positions: Any) -> Float[np.ndarray, "... n"]:
         """Return the references of the force law that runs, over samples as `run`, of what that law is given."""
-        place, force = self.split(given)
-        return self.run(place, positions) + force
+        position, force = self.split(given)
+        return self.run(position, positions) + force
 
     def run(self, references: Any, positions: Any) -> Float[np.ndarray, "... n"]:
         """Return the force law's references over samples, from rest at the first position."""

@@ -58,11 +58,11 @@ class PortModel:
     motor: VectorN
     force: VectorN
     read: Float[np.ndarray, "y n+2"]  # every signal that the law reads, the regulated force first, of x, F_m and F_e
-    speed: int  # speed, place: which states are the port's speed and its position
-    place: int
+    speed: int  # speed, position: which states are the port's speed and its position
+    position: int
     mass: float  # the inertia on the port (kg or kg m^2), which is taken off again
     delay_s: float = 0.0  # of the motor, besides the controller's
-    place_unit: str = LINEAR.place  # of the port's motion: m or rad
+    place_unit: str = LINEAR.position  # of the port's motion: m or rad
 
     def response(self, f: Frequencies) -> PortResponse:
         """Return the responses to motor force and to motion, F_e being what that motion takes. They are infinite at an
@@ -146,7 +146,7 @@ def port_of(plant: Plant, params: ParameterSet, measured: Measured, per_effort: 
         force=b[:, external].copy(),
         read=np.column_stack([c[rows], per_effort * d[rows, 0], d[rows, external]]),
         speed=states.index(rate),
-        place=states.index(coordinate),
+        position=states.index(coordinate),
         mass=values[inertia].value,
         delay_s=float(find_delay(plant, read_conditions(plant, params))),
         place_unit=probe.states[coordinate],

@@ -50,8 +50,8 @@ def place_frequencies(task: Task) -> Curve:
     for mode, zeta in {mode for plant in task.plants for mode in find_light_modes(plant)}:
         reach = max(4 * zeta, 0.02) * mode
         near.append(np.linspace(mode - reach, mode + reach, int(min(2 * reach / max(zeta * mode / 4, 1e-4), 80))))
-    own = [plant.f for plant in task.plants if isinstance(plant, MeasuredPlant)]
-    extra = [f[:: 1 + f.size // MORE_FREQUENCIES] for f in (np.sort(np.concatenate([np.zeros(0), *near])), *own)]
+    measured = [plant.f for plant in task.plants if isinstance(plant, MeasuredPlant)]
+    extra = [f[:: 1 + f.size // MORE_FREQUENCIES] for f in (np.sort(np.concatenate([np.zeros(0), *near])), *measured)]
     slow = np.geomspace(LOWEST_HZ, OBJECTIVE_HZ, SLOW_FREQUENCIES)[:-1]
     base = np.geomspace(OBJECTIVE_HZ, 0.999 * nyquist, FREQUENCIES)
     ends = [spec.bandwidth_hz, *(spec.passive_band_hz or ())]

@@ -33,10 +33,10 @@ def read_numbers(gains: Mapping[str, float], k_ff: float, ts: float) -> LawNumbe
     x[W_R] = gains["k_p"] - gains["k_r"] + (0.0 if "k_v" in gains else k_ff)
     x[W_C] = (1.0 - gains["c"]) * gains["k_d"]
     x[SPEED_RATE] = 1.0 / gains["T_v"] if "T_v" in gains else 0.0
-    for name, place in (("k_v", K_V), ("T_q", T_Q), ("notch_width", NOTCH_WIDTH), ("notch_depth", NOTCH_DEPTH)):
-        x[place] = gains.get(name, 1.0)
-    for name, place in (("notch_frequency_hz", NOTCH_W), ("prefilter_corner_hz", PREFILTER_W)):
-        x[place] = warp_frequency(gains[name], ts) if name in gains else 1.0
+    for name, index in (("k_v", K_V), ("T_q", T_Q), ("notch_width", NOTCH_WIDTH), ("notch_depth", NOTCH_DEPTH)):
+        x[index] = gains.get(name, 1.0)
+    for name, index in (("notch_frequency_hz", NOTCH_W), ("prefilter_corner_hz", PREFILTER_W)):
+        x[index] = warp_frequency(gains[name], ts) if name in gains else 1.0
     x[DAMPING] = gains.get("prefilter_damping", 1.0)
     return x
 

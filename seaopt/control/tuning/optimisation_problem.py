@@ -446,9 +446,9 @@ class Task:
         path, imposed = grid.plants.at(plants), [name for name in names if name in grid.levels]
         if path.r is None:
             return self._use(imposed, grid, path, plants, law)
-        own = [name for name in imposed if name in SCOPES["design plant"]]
-        others = [name for name in imposed if name not in own]
-        return self._use(others, grid, path, plants, law) | self._use(own, grid, path.alone, plants, law)
+        of_design = [name for name in imposed if name in SCOPES["design plant"]]
+        shared = [name for name in imposed if name not in of_design]
+        return self._use(shared, grid, path, plants, law) | self._use(of_design, grid, path.alone, plants, law)
 
     def _use(
         self, names: Sequence[str], grid: Grid, path: Path, plants: int | slice, law: LawResponse

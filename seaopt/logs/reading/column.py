@@ -85,10 +85,10 @@ class Column:
         if not np.isfinite(self.clock_offset_s):
             raise LogError(f'column "{self.column}": clock_offset_s = {self.clock_offset_s:g}; give seconds')
 
-    def to_si(self, values: VectorN, unit: str, place: str) -> VectorN:
+    def to_si(self, values: VectorN, unit: str, source: str) -> VectorN:
         """Return the values in the SI unit of `unit`; the array given is used up."""
         if self.wrap_bits is not None:
-            values = _decode_twos_complement(values, self.wrap_bits, f'{place}: column "{self.column}"')
+            values = _decode_twos_complement(values, self.wrap_bits, f'{source}: column "{self.column}"')
         with np.errstate(over="ignore", invalid="ignore"):
             for step in (self.scale, factor(unit, si_unit(unit))):
                 if step != 1.0:
@@ -97,7 +97,7 @@ class Column:
                     values += self.offset
         if np.any(np.isinf(values)):  # none of a file's numbers is
             raise LogError(
-                f'{place}: column "{self.column}": its scale, offset or unit makes a number infinite; correct it'
+                f'{source}: column "{self.column}": its scale, offset or unit makes a number infinite; correct it'
             )
         return values
 

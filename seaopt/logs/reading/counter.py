@@ -39,14 +39,14 @@ class Counter:
             shown = self.samples_per_count if abs(self.samples_per_count) < LARGEST_COUNT else "a number of many digits"
             raise LogError(f"Counter: samples_per_count = {shown}; give a whole number from 1 to {MOST_PER_COUNT}")
 
-    def open_gaps(self, time: VectorN, values: VectorN, place: str) -> tuple[VectorN, str]:
+    def open_gaps(self, time: VectorN, values: VectorN, source: str) -> tuple[VectorN, str]:
         """Return time with the later samples moved by the lost ones, and a note of what was done. Raises LogError: the
         column is not a counter: not whole, or falling.
         """
         whole = np.all((np.abs(values) < LARGEST_COUNT) & (values == np.floor(values)))
         if not whole or np.any(np.diff(values) < 0):
             raise LogError(
-                f'{place}: counter "{self.column}" is not a whole number that only rises; choose another column'
+                f'{source}: counter "{self.column}" is not a whole number that only rises; choose another column'
             )
         starts, lost = _count_losses(values, self.samples_per_count)
         total = int(lost.sum())

@@ -104,8 +104,8 @@ def read_header(name: str, unit: str | None = None, *, metres: bool = True, brac
         suffix, stem = "", bare
     words = split_words(stem)
     kinds = _list_quantities(words, stem)
-    place = bool(_matches(words, PLACE_WORDS | DEFLECTION_WORDS))
-    if suffix and not _fits(suffix, kinds, words, place=place):
+    position = bool(_matches(words, PLACE_WORDS | DEFLECTION_WORDS))
+    if suffix and not _fits(suffix, kinds, words, position=position):
         suffix, words = "", split_words(bare)
         kinds = _list_quantities(words, bare)
     measures = _quantity_of_unit(stated or suffix)
@@ -113,7 +113,9 @@ def read_header(name: str, unit: str | None = None, *, metres: bool = True, brac
         measures = "other"
     if "speed" in kinds and measures in ("angle", "length"):  # a speed in rad, say, is none the less no angle
         measures = "speed"
-    quantity = "voltage" if bare == "V" else measures or _decide(kinds, place=place, counts=COUNTS in (stated, suffix))
+    quantity = (
+        "voltage" if bare == "V" else measures or _decide(kinds, position=position, counts=COUNTS in (stated, suffix))
+    )
     return Header(
         name=name,
         quantity=quantity,
@@ -186,13 +188,13 @@ def _split_suffix(name: str) -> tuple[str, str]:
     return "", name
 
 
-def _fits(unit: str, kinds: list[Quantity], words: list[str], *, place: bool) -> bool:
+def _fits(unit: str, kinds: list[Quantity], words: list[str], *, position: bool) -> bool:
     """Tell whether a suffix is a unit of what the other words say; tau_s is a torque, and theta_m an angle."""
     measured = _quantity_of_unit(unit)
     if unit == COUNTS or measured in kinds:
         return True
     if measured in ("angle", "length"):
-        return (place and "speed" not in kinds) or (not kinds and unit != "m")
+        return (position and "speed" not in kinds) or (not kinds and unit != "m")
     if measured in ("current", "voltage", "force") and _matches(words, COMMAND_WORDS | MEASURED_WORDS):
         return not kinds  # cmd_A, act_N: of a single letter alone nothing else could be meant
     return not kinds and len(unit) > 1 and bool(words)
@@ -205,26 +207,28 @@ def _find_number(words: list[str]) -> int | None:
 
 
 def _list_quantities(words: list[str], name: str) -> list[Quantity]:
-    kinds: list[Quantity] = [quantity for quantity, known in QUANTITY_WORDS.items() if _matches(words, known)]
+    kinds: list[Quantity] = [quantity for quantity, vocabulary in QUANTITY_WORDS.items() if _matches(words, vocabulary)]
     if "time" in kinds and set(_matches(words, QUANTITY_WORDS["time"])) == {"t"} and not is_named_time(name):
         kinds.remove("time")  # as in pos_t
     # What is no signal is named in full, or else "states" would be a state.
     return [kind for kind in kinds if kind != "other" or any(word in QUANTITY_WORDS["other"] for word in words)]
 
 
-def _matches(words: Iterable[str], known: frozenset[str]) -> list[str]:
+def _matches(words: Iterable[str], vocabulary: frozenset[str]) -> list[str]:
     """Return the words that are known, or hold a long known one."""
-    long = [word for word in known if len(word) >= LONG]
+    long = [word for word in vocabulary if len(word) >= LONG]
     bare = ((word, word.rstrip("0123456789")) for word in words)
-    return [word for word, stem in bare if word in known or stem in known or any(part in word for part in long)]
+    return [
+        word for word, stem in bare if word in vocabulary or stem in vocabulary or any(part in word for part in long)
+    ]
 
 
-def _decide(kinds: list[Quantity], *, place: bool, counts: bool) -> Quantity:
+def _decide(kinds: list[Quantity], *, position: bool, counts: bool) -> Quantity:
     """Return the one quantity of a name's words; of several, the most telling."""
     for quantity in ("other", "speed", "duty", "current", "voltage", "torque", "force", "angle", "length", "time"):
         if quantity in kinds:
             return quantity
-    return "angle" if place or counts else ""
+    return "angle" if position or counts else ""
 
 
 def _find_side(words: list[str]) -> Side:

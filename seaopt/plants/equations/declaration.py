@@ -118,13 +118,13 @@ def check_roles(plant: Plant) -> None:
             ("friction", f"friction.{name}", friction),
             ("bristles", f"friction.{name}.bristles", friction.bristles),
         ]
-    for kind, place, role in roles:
+    for kind, key, role in roles:
         for field, group in _REFERENCES[kind].items():
             stated = getattr(role, field, None) or ()
             for name in (stated,) if isinstance(stated, str) else stated:
                 if name not in groups[group]:
                     raise PlantError(
-                        f'plant {plant.name}: {place}.{field} = "{name}" is not one of its own; '
+                        f'plant {plant.name}: {key}.{field} = "{name}" is not one of its own; '
                         f"{suggestion(name, groups[group])}"
                     )
     if plant.actuation is not None and plant.actuation.input != next(iter(plant.inputs)):

@@ -92,16 +92,16 @@ class Token:
 Explain = Callable[[str], str | None]  # why a name may not stand in a text; None of a name that is not known at all
 
 
-def parse(text: str, symbols: Mapping[str, Any], place: str, explain: Explain = lambda name: None) -> Any:
+def parse(text: str, symbols: Mapping[str, Any], key: str, explain: Explain = lambda name: None) -> Any:
     r"""Return the scalar CasADi expression that a text, of at most 10,000 characters, stands for in the grammar above.
-    `symbols`: what it may name, besides the functions and `pi`. `place`: what the text is, for messages, such as
+    `symbols`: what it may name, besides the functions and `pi`. `key`: what the text is, for messages, such as
     "f.omega". `explain`: why a name that is not among the symbols may not stand here; None where it is not known.
     Raises PlantError: the text is not in the grammar, names what is not known, is too long, or is no finite number; a
     note of the error shows the place in the text.
     """
     if len(text) > MAX_LENGTH:
-        raise PlantError(f"{place} has {len(text)} characters; give at most {MAX_LENGTH}, or use definitions")
-    return _Parser(text, symbols, place, explain).read_all()
+        raise PlantError(f"{key} has {len(text)} characters; give at most {MAX_LENGTH}, or use definitions")
+    return _Parser(text, symbols, key, explain).read_all()
 
 
 def list_names(text: str) -> list[str]:
@@ -113,8 +113,8 @@ def list_names(text: str) -> list[str]:
 class _Parser:
     """Reads one text from left to right."""
 
-    def __init__(self, text: str, symbols: Mapping[str, Any], place: str, explain: Explain) -> None:
-        self.text, self.symbols, self.place, self.explain = text, symbols, place, explain
+    def __init__(self, text: str, symbols: Mapping[str, Any], key: str, explain: Explain) -> None:
+        self.text, self.symbols, self.key, self.explain = text, symbols, key, explain
         self.tokens = [
             Token(kind=str(match.lastgroup), text=match[str(match.lastgroup)], start=match.start(str(match.lastgroup)))
             for match in _TOKEN.finditer(text)
@@ -270,9 +270,9 @@ class _Parser:
         line, column = self.text[first:].split("\n", 1)[0], token.start - first
         row = self.text.count("\n", 0, token.start) + 1
         where = f"column {column + 1}" if "\n" not in self.text.strip() else f"line {row}, column {column + 1}"
-        error = PlantError(f"{self.place}, {where}: {what}")
+        error = PlantError(f"{self.key}, {where}: {what}")
         cut = max(0, column - SHOWN)
-        before = f"{self.place} = " + "..." * (cut > 0) + printable(line[cut:column].replace("\t", " "))
+        before = f"{self.key} = " + "..." * (cut > 0) + printable(line[cut:column].replace("\t", " "))
         after = printable(line[column : column + SHOWN].replace("\t", " ")) + "..." * (len(line) > column + SHOWN)
         error.add_note(f"    {before}{after}\n    {' ' * len(before)}^")
         return error

@@ -55,7 +55,7 @@ STRAIGHT = 1e-12  # 1/A^2: a torque constant that droops less does not droop at 
 
 
 def _fall_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
-    return (declare("a_v", 0.0, f"s/{effort.place}", -math.inf, "share of torque that is lost, over the speed"),)
+    return (declare("a_v", 0.0, f"s/{effort.position}", -math.inf, "share of torque that is lost, over the speed"),)
 
 
 def _drift_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
@@ -76,12 +76,12 @@ def _cogging_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
     return (
         declare("a_g", 0.0, effort.unit, -math.inf, "cogging, sine of the motor's position"),
         declare("b_g", 0.0, effort.unit, -math.inf, "cogging, cosine of the motor's position"),
-        declare("n_g", 6.0, f"rad/{effort.place}", 0.0, "phase of cogging over the motor's position"),
+        declare("n_g", 6.0, f"rad/{effort.position}", 0.0, "phase of cogging over the motor's position"),
     )
 
 
 def _stand_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
-    return (declare("c_t", 0.0, f"{effort.place}/({effort.unit})", 0.0, "compliance of the stand"),)
+    return (declare("c_t", 0.0, f"{effort.position}/({effort.unit})", 0.0, "compliance of the stand"),)
 
 
 BACK_DRIVING = declare("d_e", 0.0, "-", -0.9, "share of the spring's effort lost driving, less driven")

@@ -74,13 +74,13 @@ class Proposed:
 class _Lines:
     """Lines of [parameters], each with what it is and what of it is a guess."""
 
-    def __init__(self, interview: Interview, facts: Facts, own: Mapping[str, Parameter], stiffness: str) -> None:
+    def __init__(self, interview: Interview, facts: Facts, defaults: Mapping[str, Parameter], stiffness: str) -> None:
         """Take the parameters of an actuator, of the parts around it, and of a sensor that computes its effort."""
         self.interview = interview
         self.parts = _DRIVES.get(facts.input, ())
         (nominal,) = PARTS["deflection_sensor"]
         around = {parameter.name: parameter for part in self.parts for parameter in PARTS[part]}
-        self.defaults = {**own, **around, nominal.name: replace(nominal, unit=stiffness)}
+        self.defaults = {**defaults, **around, nominal.name: replace(nominal, unit=stiffness)}
         self.lines: list[ParameterLine] = []
 
     def value(self, name: str) -> float:
@@ -100,7 +100,7 @@ class _Lines:
         more = "".join(f", {key} = {number:.10g}" for key, number in bounds.items())
         self.add(name, f"{{ value = {value:.10g}, free = true{more} }}")
 
-    def known(self, name: str, text: str, guess: float | None = None, why: str = "a typical value") -> float:
+    def require(self, name: str, text: str, guess: float | None = None, why: str = "a typical value") -> float:
         """Ask for a value that no log can tell, and write it."""
         start = self.defaults[name].value if guess is None else guess
         value = self.interview.number(name, self._add_unit(text, name), start, why, USUAL.get(name))
@@ -131,11 +131,11 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
     """Return a gear's actuator."""
     lines = _Lines(interview, facts, rotary(link="pendulum").defaults, "N m/rad")
     effort, motor, link = (name in facts.outputs for name in ("tau_s", "theta_m", "theta_l"))
-    moves = any(place != "held" for place in facts.places)
+    moves = any(mounting != "held" for mounting in facts.places)
     why = "typical of a module; take it from the data sheet"
     if facts.gear_ratio is not None:
         why = "the motor turns this many times as far as the link"
-    lines.known("N", "Gear ratio N (turns of the motor for one of the output)", facts.gear_ratio, why)
+    lines.require("N", "Gear ratio N (turns of the motor for one of the output)", facts.gear_ratio, why)
     _add_drive(lines, facts, effort=effort)
     lines.free("J_m")
     lines.free("b_r")
@@ -151,7 +151,7 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
         lines.free("J_l")
         lines.free("d_l", 0.1)
     if "hanging" in facts.places:
-        lines.known("m", "Mass of the hanging link", why="a typical value; only m L matters, and L is fitted")
+        lines.require("m", "Mass of the hanging link", why="a typical value; only m L matters, and L is fitted")
         lines.free("L", max=2.0)
     places = list(facts.places)
     measured = "tau_s" if effort else "tau_d" if motor and link else ""
@@ -164,10 +164,10 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
             ranges = _add_payload(lines, places)
     if measured == "tau_d":  # the torque of two encoders, by a constant of the firmware's
         text = "Stiffness k_n that the firmware multiplies the deflection by"
-        lines.known("k_n", text, lines.value("k_s"), "that of the spring")
+        lines.require("k_n", text, lines.value("k_s"), "that of the spring")
         parts.append("deflection_sensor")
     options = {"parts": parts} if parts else {}
-    plants = {place: {"kind": "rotary", "link": _LINKS[place], **options} for place in places}
+    plants = {mounting: {"kind": "rotary", "link": _LINKS[mounting], **options} for mounting in places}
     return Proposed(lines=tuple(lines.lines), plants=plants, measured=measured, ranges=ranges)
 
 
@@ -188,7 +188,7 @@ def _add_drive(lines: _Lines, facts: Facts, *, effort: bool) -> None:
         if effort:
             lines.free("eta", max=2.0)
     elif not effort:
-        lines.known("K_tau", scaled, why=_ALL_SCALE)
+        lines.require("K_tau", scaled, why=_ALL_SCALE)
     else:
         value = lines.optional("K_tau", scaled, "it is fitted, and includes the losses of the drive")
         if value is None:
@@ -197,11 +197,13 @@ def _add_drive(lines: _Lines, facts: Facts, *, effort: bool) -> None:
             lines.add("K_tau", f"{value:.10g}")
             lines.free("eta", 0.9, max=1.5)
     if facts.input in ("V", "duty"):
-        lines.known("R", "Winding resistance R", why="a typical value; take it from the data sheet")
+        lines.require("R", "Winding resistance R", why="a typical value; take it from the data sheet")
     if facts.input == "duty":
-        lines.known("V_s", "Supply voltage V_s")
+        lines.require("V_s", "Supply voltage V_s")
     if facts.input == "goal":
-        lines.known("k_p", "Gain k_p of the position loop: current for one rad of error at the motor", 10.0, _ALL_SCALE)
+        lines.require(
+            "k_p", "Gain k_p of the position loop: current for one rad of error at the motor", 10.0, _ALL_SCALE
+        )
 
 
 def _add_payload(lines: _Lines, places: list[str]) -> dict[str, tuple[float, float]]:
@@ -216,13 +218,13 @@ def _add_payload(lines: _Lines, places: list[str]) -> dict[str, tuple[float, flo
     if mass is None:
         return {}
     lines.add("m", f"{mass:.10g}")
-    reach = lines.known("L", "Distance L from its centre of mass to the joint", why="a typical value; measure it")
+    reach = lines.require("L", "Distance L from its centre of mass to the joint", why="a typical value; measure it")
     places.append("hanging")
     if "free" in places:
         return {}
     point = float(f"{INERTIA_OVER_POINT * mass * reach**2:.3g}")
-    inertia = lines.known("J_l", "Its inertia J_l about the joint", point, "a third more than that of a point mass")
-    lines.known("d_l", "Damping d_l at the joint", 0.1)
+    inertia = lines.require("J_l", "Its inertia J_l about the joint", point, "a third more than that of a point mass")
+    lines.require("d_l", "Damping d_l at the joint", 0.1)
     return {"J_l": (WIDE[0] * inertia, WIDE[1] * inertia)}
 
 
@@ -232,8 +234,8 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     forces, moves = facts.outputs & {"F1", "F2"}, "swing" in facts.places
     also = ", and correct the scale of q with it" if "screw" in facts.outputs else ""
     why = f"a typical value; take it from the data sheet{also}"
-    lines.known("l", "Travel l for one turn (lead of the screw, or circumference of the belt's pulley)", why=why)
-    lines.known("N_p", "Reduction N_p between motor and screw", 1.0, f"driven directly{also}")
+    lines.require("l", "Travel l for one turn (lead of the screw, or circumference of the belt's pulley)", why=why)
+    lines.require("N_p", "Reduction N_p between motor and screw", 1.0, f"driven directly{also}")
     _add_drive(lines, facts, effort=bool(forces))
     lines.free("J", 1e-5)
     lines.free("b_r")
@@ -264,14 +266,14 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
             places.append("swing")
             ranges["I_p"] = (WIDE[0] * inertia, WIDE[1] * inertia)
     options = {"drive": "unlumped", **({"parts": list(lines.parts)} if lines.parts else {})}
-    plants = {place: {"kind": _SCREWS[place], **options} for place in places}
+    plants = {mounting: {"kind": _SCREWS[mounting], **options} for mounting in places}
     return Proposed(lines=tuple(lines.lines), plants=plants, measured=measured, ranges=ranges)
 
 
 def _add_pendulum(lines: _Lines, noun: str) -> None:
-    lines.known("L_a", "Lever arm L_a of the force about the pivot", why="a typical value; measure it")
-    lines.known("m", f"Mass of the {noun}", why="a typical value; weigh it")
-    lines.known("L", "Distance L from its centre of mass to the pivot", why="a typical value; measure it")
+    lines.require("L_a", "Lever arm L_a of the force about the pivot", why="a typical value; measure it")
+    lines.require("m", f"Mass of the {noun}", why="a typical value; weigh it")
+    lines.require("L", "Distance L from its centre of mass to the pivot", why="a typical value; measure it")
 
 
 def screw_travel(lines: Sequence[ParameterLine]) -> float:

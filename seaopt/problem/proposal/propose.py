@@ -193,14 +193,14 @@ def _assign(survey: LogSurvey, interview: Interview, turns: bool, stated: Stated
     whole = interview.ask("roles", "Are these the right columns?", "yes", "by names and samples", ("yes", "no"))
     if whole == "yes":
         return _check_outputs(roles, survey)
-    known = {column.name: role for role, column in roles.columns.items()}
+    assigned = {column.name: role for role, column in roles.columns.items()}
     choices = (*INPUTS, *(ROTARY_OUTPUTS if turns else LINEAR_OUTPUTS), "none")
     given = {
         column.name: stated.roles.get(column.name)
         or interview.ask(
             f"role:{column.name}",
             f'What is column "{column.name}"?',
-            known.get(column.name, "none"),
+            assigned.get(column.name, "none"),
             "by its name",
             choices,
         )
@@ -209,8 +209,8 @@ def _assign(survey: LogSurvey, interview: Interview, turns: bool, stated: Stated
     chosen = [role for role in given.values() if role in INPUTS]
     if len(chosen) != 1:
         raise ProblemError(f"{survey.name}: {len(chosen)} columns are inputs; give exactly one of {', '.join(INPUTS)}")
-    known = {name: "" if role == "none" else role for name, role in given.items()}
-    return _check_outputs(assign(survey, rotary=turns, given=known), survey)
+    answers = {name: "" if role == "none" else role for name, role in given.items()}
+    return _check_outputs(assign(survey, rotary=turns, given=answers), survey)
 
 
 def _check_outputs(roles: Assignment, survey: LogSurvey) -> Assignment:

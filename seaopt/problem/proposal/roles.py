@@ -84,8 +84,8 @@ def assign(survey: LogSurvey, *, rotary: bool, given: Mapping[str, str]) -> Assi
         columns = {role: columns.pop(role), **columns}
     # Of two columns of one role, the measured one, and then the first, is taken.
     free.sort(key=lambda column: (column.header.commanded, not column.header.measured))
-    place = _place_rotary if rotary else _place_linear
-    doubts |= place([column for column in free if not column.header.commanded], columns)
+    assign = _place_rotary if rotary else _place_linear
+    doubts |= assign([column for column in free if not column.header.commanded], columns)
     used = {column.name for column in columns.values()}
     return Assignment(
         rotary=rotary,
@@ -115,9 +115,9 @@ def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, Sur
         return f"the input is {roles[source].name}"
     angles = ("theta_m", "theta_l") if rotary else ("screw", "phi")
     of_side = {"motor": angles[:1], "link": angles[1:]}.get(header.side, angles)
-    own = {"torque": ("tau_s",)} if rotary else {"force": ("F1", "F2"), "length": ("q",) * (header.side != "link")}
+    signals = {"torque": ("tau_s",)} if rotary else {"force": ("F1", "F2"), "length": ("q",) * (header.side != "link")}
     places = ("deflection",) if rotary and header.deflection else of_side
-    taken = [roles[role].name for role in (own | {"angle": places}).get(header.quantity, ()) if role in roles]
+    taken = [roles[role].name for role in (signals | {"angle": places}).get(header.quantity, ()) if role in roles]
     if taken:
         return f"{join_words(taken)} {'is' if len(taken) == 1 else 'are'} that already"
     if not rotary and header.quantity == "length":
@@ -146,8 +146,8 @@ def _find_input(columns: Sequence[SurveyedColumn], survey: LogSurvey) -> tuple[s
             continue
         # A current that was commanded is there before the one that was measured.
         best = min(named, key=lambda column: (not column.header.commanded, column.header.side == "link"))
-        others = [column.name for column in named if column is not best]
-        return role, best, f"the input, and not {', '.join(others)}" if others else ""
+        passed_over = [column.name for column in named if column is not best]
+        return role, best, f"the input, and not {', '.join(passed_over)}" if passed_over else ""
     likely = [column for column in columns if not column.header.quantity]
     likely = likely or [column for column in columns if column.header.quantity in ("torque", "angle")]
     if not likely:

@@ -132,17 +132,17 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
     columns = {name: _fill_column(headers[name], raw[name], name == chosen) for name in members}
     overlap = None
     if chosen is not None:
-        others = {other: names for other, names in groups.items() if other and other != chosen}
-        moved, overlap = _move_to_clock(columns[chosen], others, headers, raw)
+        clocks = {clock: names for clock, names in groups.items() if clock and clock != chosen}
+        moved, overlap = _move_to_clock(columns[chosen], clocks, headers, raw)
         columns |= moved
     size = raw[chosen or members[0]].size
     wrong = {name: _describe_length(raw[name], size) for name in numeric if name not in {**columns, **groups}}
     moving = [column for name, column in columns.items() if name != chosen and name not in times and column.swing > 0.0]
     if not moving:
-        others = [name for name in wrong if raw[name].size > 1]
-        if others:
+        longer = [name for name in wrong if raw[name].size > 1]
+        if longer:
             raise LogError(
-                f"{path}: {join_words(others[:MOST_NAMED])} have other numbers of samples than "
+                f"{path}: {join_words(longer[:MOST_NAMED])} have other numbers of samples than "
                 f'"{chosen or members[0]}" ({size}); save each with times of its own, or cut them to one length'
             )
         raise LogError(f"{path}: no column varies; record a log in which the actuator moves")
@@ -263,18 +263,18 @@ def _move_to_clock(
     time, moved = raw[clock.name] * factor(_read_unit(clock.name, headers, raw), "s"), dict[str, SurveyedColumn]()
     low, high, instants = float(np.nanmin(time)), float(np.nanmax(time)), np.unique(time[np.isfinite(time)])
     for other, names in groups.items():
-        own = raw[other] * factor(_read_unit(other, headers, raw), "s")
-        there = np.isfinite(own)
-        if np.count_nonzero(there) < 2 or np.any(np.diff(own[there]) <= 0.0):
+        stamps = raw[other] * factor(_read_unit(other, headers, raw), "s")
+        there = np.isfinite(stamps)
+        if np.count_nonzero(there) < 2 or np.any(np.diff(stamps[there]) <= 0.0):
             continue
-        low, high = max(low, float(own[there][0])), min(high, float(own[there][-1]))
+        low, high = max(low, float(stamps[there][0])), min(high, float(stamps[there][-1]))
         for name in names:
             if name != other:
                 good = there & np.isfinite(raw[name])
-                values = np.interp(time, own[good], raw[name][good], np.nan, np.nan) if np.any(good) else raw[name]
+                values = np.interp(time, stamps[good], raw[name][good], np.nan, np.nan) if np.any(good) else raw[name]
                 moved[name] = SurveyedColumn(
                     header=headers[name], values=values, clock=other, readings=raw[name][good],
-                    fast=bool(np.any(good)) and measure_pace(instants, own[good]) > MOST_PACE,
+                    fast=bool(np.any(good)) and measure_pace(instants, stamps[good]) > MOST_PACE,
                 )  # fmt: skip
     return moved, (low, high) if low < high else None
 

@@ -43,7 +43,7 @@ def make_rigid_link(sample_time_s: float, delay_samples: int) -> ControlledLink:
     )
     a = np.array([[0.0, 1.0], [0.0, 0.0]])
     push = np.array([0.0, 1.0])
-    port = PortModel(a=a, motor=push, force=push, read=np.array([[0.0, 0.0, 1.0, 0.0]]), speed=1, place=0, mass=1.0)
+    port = PortModel(a=a, motor=push, force=push, read=np.array([[0.0, 0.0, 1.0, 0.0]]), speed=1, position=0, mass=1.0)
     return ControlledLink(port=port, load=Load(inertia=1.0), law=law, delay_samples=delay_samples, direction=1.0)
 
 
