@@ -56,7 +56,7 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
     shares: dict[str, CoherentShare] = {}
     if not inputs:
         return shares
-    total = sum(len(rows) for rows in inputs)
+    total = sum(rows.shape[1] for rows in inputs)
     # Even, for stretches overlap by half, and without a prime factor above 5, for transforms are quick then.
     longest = (min(max(2 * total // count, SHORTEST), total) for count in STRETCHES)
     lengths = sorted({2 * find_quick_size_within(samples // 2) for samples in longest})
@@ -74,43 +74,44 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
 
 def _gather(
     experiment: FitExperiment, residuals: ExperimentResiduals
-) -> tuple[list[Float[np.ndarray, "n m"]], list[Float[np.ndarray, "n ny2"]]]:
+) -> tuple[list[Float[np.ndarray, "m n"]], list[Float[np.ndarray, "ny2 n"]]]:
     """Return the inputs that move and [measured, residual] of each output, of each segment's samples that count. A
     sample that does not count is replaced by the model's, and a missing one by those beside it.
     """
-    moving: list[Float[np.ndarray, "n m"]] = []
-    signals: list[Float[np.ndarray, "n ny2"]] = []
+    moving: list[Float[np.ndarray, "m n"]] = []
+    signals: list[Float[np.ndarray, "ny2 n"]] = []
     delay = round(experiment.slots.delay.value / experiment.period)
     for segment, left in zip(experiment.segments, residuals.segments, strict=True):
-        samples = segment.samples
-        u = np.stack(samples.inputs[: max(len(experiment.data.plant.inputs), 1)], axis=1)  # no readings
+        samples, raw = segment.samples, left.raw.T
+        u = np.stack(samples.inputs[: max(len(experiment.data.plant.inputs), 1)])  # no readings
         if delay:
-            u = np.concatenate([np.repeat(u[:1], min(delay, len(u)), axis=0), u[: max(len(u) - delay, 0)]])
-        used = segment.mark_counted(0)
-        last = max((row.size - int(np.argmax(row[::-1])) for row in used.T if row.any()), default=0)
-        error = np.where(used | np.isnan(left.raw), -left.raw, 0.0)
-        measured = np.stack(samples.y, axis=1)
-        measured = np.where(used, measured, measured + left.raw)
-        error, measured = (np.stack([bridge(column) for column in rows.T], axis=1) for rows in (error, measured))
-        if last > 1 and np.all(np.isfinite(measured[:last])):
-            moving.append(u[:last])
-            signals.append(np.concatenate([measured.T, _tame(error, used).T])[:, :last].T)  # cut by signal later
+            n = u.shape[1]
+            u = np.hstack([np.repeat(u[:, :1], min(delay, n), axis=1), u[:, : max(n - delay, 0)]])
+        used = np.ascontiguousarray(segment.mark_counted(0).T)
+        last = max((row.size - int(np.argmax(row[::-1])) for row in used if row.any()), default=0)
+        error = np.where(used | np.isnan(raw), -raw, 0.0)
+        measured = np.stack(samples.y)
+        measured = np.where(used, measured, measured + raw)
+        error, measured = (np.stack([bridge(row) for row in rows]) for rows in (error, measured))
+        if last > 1 and np.all(np.isfinite(measured[:, :last])):
+            moving.append(u[:, :last])
+            signals.append(np.concatenate([measured, _tame(error, used)])[:, :last])
     if not moving:
         return [], []
-    spread = np.ptp(np.concatenate(moving), axis=0)
-    chosen = np.flatnonzero(spread > 1e-12 * np.max(np.abs(np.concatenate(moving)), axis=0, initial=1e-300))
-    return ([rows[:, chosen] for rows in moving], signals) if chosen.size else ([], [])
+    whole = np.hstack(moving)
+    chosen = np.flatnonzero(np.ptp(whole, axis=1) > 1e-12 * np.max(np.abs(whole), axis=1, initial=1e-300))
+    return ([rows[chosen] for rows in moving], signals) if chosen.size else ([], [])
 
 
-def _tame(error: Float[np.ndarray, "n ny"], used: Bool[np.ndarray, "n ny"]) -> Float[np.ndarray, "n ny"]:
+def _tame(error: Float[np.ndarray, "ny n"], used: Bool[np.ndarray, "ny n"]) -> Float[np.ndarray, "ny n"]:
     """Return a residual whose outliers are cut: one sample of heavy-tailed noise is all of a short stretch's power."""
     tamed = error.copy()
-    for o in range(error.shape[1]):
-        kept = error[used[:, o], o]
-        if kept.size:
-            middle = float(np.median(kept))
-            scale = OUTLIER * 1.4826 * float(np.median(np.abs(kept - middle)))
-            tamed[:, o] = np.clip(error[:, o], middle - scale, middle + scale) if scale > 0.0 else error[:, o]
+    for row, kept in zip(tamed, used, strict=True):
+        if kept.any():
+            middle = float(np.median(row[kept]))
+            scale = OUTLIER * 1.4826 * float(np.median(np.abs(row[kept] - middle)))
+            if scale > 0.0:
+                np.clip(row, middle - scale, middle + scale, out=row)
     return tamed
 
 
@@ -159,17 +160,17 @@ class _Spectra:
 
 
 def _make_spectra(
-    inputs: Sequence[Float[np.ndarray, "_ m"]],
-    outputs: Sequence[Float[np.ndarray, "_ s"]],
+    inputs: Sequence[Float[np.ndarray, "m _"]],
+    outputs: Sequence[Float[np.ndarray, "s _"]],
     length: int,
     experiment: FitExperiment,
 ) -> _Spectra | None:
     """Return the spectra over stretches of one length; None where there are too few of them. Stretches are summed as
     they come, short ones several at a time: the memory is small, however long the logs are.
     """
-    every = [(i, row) for i, rows in enumerate(inputs) for row in welch.list_starts([slice(0, len(rows))], length)]
+    every = [(i, row) for i, rows in enumerate(inputs) for row in welch.list_starts([slice(0, rows.shape[1])], length)]
     starts = welch.thin(every, MOST)
-    averages, m = welch.INDEPENDENT * len(starts), inputs[0].shape[1]
+    averages, m = welch.INDEPENDENT * len(starts), len(inputs[0])
     if len(starts) < FEWEST or averages < 2.0 * m + 1.0:
         return None
     frequency = np.fft.rfftfreq(length, experiment.period)
@@ -179,14 +180,14 @@ def _make_spectra(
     if lines < 3:
         return None
     window = welch.hann(length)
-    s = outputs[0].shape[1]
+    s = len(outputs[0])
     of_inputs, across = np.zeros((m, m, lines), dtype=complex), np.zeros((m, s, lines), dtype=complex)
     power = np.zeros((s, lines))
     together = max(TOGETHER // length, 1)
     for first in range(0, len(starts), together):
         cuts = starts[first : first + together]
         u, y = (
-            welch.transform(np.stack([rows[i][a : a + length].T for i, a in cuts]), window)[..., kept]
+            welch.transform(np.stack([rows[i][:, a : a + length] for i, a in cuts]), window)[..., kept]
             for rows in (inputs, outputs)
         )
         conjugate = np.conj(u)[:, :, None]

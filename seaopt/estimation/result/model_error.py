@@ -244,8 +244,8 @@ def _sum_parts(
                     information[k] += _gram(weighted[:, :, chosen], along[:, :, chosen])
                     score[k] += np.sum(scores[:, chosen], axis=1)
                 for s, mask in enumerate(high[:, rows]):
-                    half_information[s] += _gram(weighted[:, :, mask], along[:, :, mask])
-                    half_score[s] += np.sum(scores[:, mask], axis=1)
+                    half_information[s] += _gram(weighted * mask, along)
+                half_score += high[:, rows] @ scores.T
                 in_half += np.count_nonzero(high[:, rows], axis=1)
                 grams += np.matmul(along, along.transpose(0, 2, 1))
                 for o, rounding in enumerate(coarse):
