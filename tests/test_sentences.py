@@ -20,7 +20,6 @@ READERS = {
     "control/tuning/tuner.py": "labels of limits that are broken, as active_constraints",
     "errors.py": "blanks of an error's text",
     "files.py": "Python's own text of an error, without its advice to programmers",
-    "estimation/problem/experiment.py": "a note that is there already is not added again",
     "estimation/result/identifiability.py": "EXPERIMENT.NAME of an unknown",
     "logs": "columns and files",
     "plants": "equations and files",
