@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -56,6 +56,8 @@ class ForceRun:
         each step of the law took.
     state : array, shape (n, nx)
         Of the plant.
+    outputs : mapping of name to array, shape (n,)
+        Of the plant at the samples, without the sensors' errors.
     error : float
         Estimated integration error of the worst sample, over the state's largest value until then.
     substeps : int
@@ -70,6 +72,7 @@ class ForceRun:
     current: Float[np.ndarray, " n"]
     law_time_s: Float[np.ndarray, " n"]
     state: Float[np.ndarray, "n nx"]
+    outputs: Mapping[str, Float[np.ndarray, " n"]]
     error: float
     substeps: int
     unit: str = LINEAR.unit
@@ -196,15 +199,14 @@ def close_loop(
     disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
     x = np.zeros(len(plant.states)) if start_state is None else start_state
     law, time_s = start, sample_time_s * np.arange(n)
-    force, current, law_time_s, states = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros((n, len(plant.states)))
+    made, current, law_time_s, states = np.zeros((n, len(plant.outputs))), *np.zeros((2, n)), np.zeros((n, len(x)))
 
     def inputs(k: int, sample: int) -> list[float]:
         return [(current[sample] if sample >= 0 else start_command) + disturbance[k], *idle]
 
     for k in range(n):
         older = k - newer - (rest_s > 0.0)
-        outputs = output(time_s[k], x, inputs(k, min(older, k - 1)), p)[0][:, 0]
-        force[k] = outputs[row]
+        made[k] = outputs = output(time_s[k], x, inputs(k, min(older, k - 1)), p)[0][:, 0]
         call_start_s = time.perf_counter()
         coming = reference[k : k + 1 + preview_samples] if preview_samples else float(reference[k])
         readings = [read(outputs, float(each)) for read, each in zip(reads, noise[:, k], strict=True)]
@@ -218,10 +220,11 @@ def close_loop(
     return ForceRun(
         time=time_s,
         reference=reference,
-        force=force,
+        force=made[:, row],
         current=current,
         law_time_s=law_time_s,
         state=states,
+        outputs=dict(zip(plant.outputs, made.T, strict=True)),
         error=integrator.error,
         substeps=2 * integrator.substeps,
         unit=plant.outputs[signals[0]],

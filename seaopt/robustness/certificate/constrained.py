@@ -22,7 +22,6 @@ from dataclasses import field, replace
 from functools import partial
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from seaopt.bench import Sensors
@@ -41,7 +40,7 @@ from seaopt.control import (
 from seaopt.control.laws.delay import DELAY_KEYS
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.outer_loop import FIRST, follow_link
-from seaopt.control.loops.sampled_plant import DELAYS, conditions, find_delay, read_conditions, whole_samples
+from seaopt.control.loops.sampled_plant import DELAYS, conditions
 from seaopt.control.mpc.active_set import UNFINISHED
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
 from seaopt.errors import SeaoptError
@@ -49,17 +48,18 @@ from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.plant import deflection_row, output_function
+from seaopt.plants.plant import deflection_row
 from seaopt.progress import Progress, count_off
 from seaopt.records import Result, record
 from seaopt.robustness.certificate.cases import Check, Evidence, Survey
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import place_values
-from seaopt.robustness.verification.judgement import LINE_SIGMAS, find_noise_floor
+from seaopt.robustness.verification.judgement import Fault, Judge, find_noise_floor, take_ends
 from seaopt.robustness.verification.linear import LinearView, view_loop
 from seaopt.robustness.verification.oscillation import Oscillation, Signal, measure_swing
 from seaopt.robustness.verification.playback import Stage
+from seaopt.robustness.verification.scenarios import SETTLED
 from seaopt.robustness.verification.verification import make_stages
 from seaopt.units import LINEAR
 
@@ -69,7 +69,7 @@ DISTURBANCE_SHARE = 0.1  # of the limit of the command, at most
 PERIODS, LEAST_PHASE_S, REST_S = 3.0, 0.1, 0.02  # of the bandwidth that a phase lasts besides a preview; before it
 JUDGED_PERIODS = 8.0  # of the bandwidth that the last phase lasts besides, in which a ring would last
 SLOWEST = 0.5  # of the bandwidth: slower rings, of the linear law, are looked for in its own simulations
-LAST_SHARE, SETTLED = 0.2, 0.1  # of a phase, over which the force is off by at most this share of the step
+LAST_SHARE = 0.2  # of a phase, over which the force is off by at most a settled share of the step
 FORGOTTEN = 1e-3  # of a mode, that is left after a sample
 RUNAWAY, GROWTH = 3.0, 1.5  # times what the limits hold; second half of the last phase over its first
 CONSTRAINED_FAILURES, CONSTRAINED_PROBABILITY = "constrained_failures", "constrained_failure_probability"
@@ -212,10 +212,9 @@ class ConstrainedRuns(Result):
 
 @record(eq=False)
 class _Outcome:
-    """One run on one plant: its first fault ("" if none), its ring's peak, and what the law did in so many steps."""
+    """One run on one plant: its first fault, the signal furthest out of bounds, its ring, and what the law did."""
 
-    kind: str = ""
-    text: str = ""
+    fault: Fault | None = None
     violation: float = 0.0
     signal: str = ""
     ring: float = 0.0
@@ -258,32 +257,33 @@ class _Case:
 
     def play(self) -> _Outcome:
         """Simulate the run, and judge it."""
-        steps: list[MPCStep] = []
-        return replace(
-            self._judge(steps),
+        mpc, judge, steps, figures = self.mpc, Judge(), list[MPCStep](), dict[str, Any]()
+        try:
+            run = self._simulate(steps)
+        except SeaoptError as error:
+            judge.refuse(DIVERGED, str(error))
+        else:
+            figures = self._judge(run, np.array([step.target_N for step in steps]), judge)
+        current = np.array([step.current_A for step in steps])  # before the amplifier rounds it
+        slews = np.abs(np.diff(current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
+        at_limit = int(np.count_nonzero(slews | (np.abs(current) > mpc.command_limit * (1.0 - 1e-6))))
+        return _Outcome(
+            fault=judge.faults[0] if judge.faults else None,
             steps=len(steps),
             unsolved=sum(not step.solved for step in steps),
             late=sum(step.status.startswith(UNFINISHED) and not step.solved for step in steps),
             iterations=max((step.iterations for step in steps), default=0),
+            at_limit=at_limit,
+            **figures,
         )
 
-    def _judge(self, steps: list[MPCStep]) -> _Outcome:
-        mpc = self.mpc
-        try:
-            run = self._simulate(steps)
-        except SeaoptError as error:
-            return _Outcome(kind=DIVERGED, text=str(error))
+    def _judge(self, run: ForceRun, target: Signal, judge: Judge) -> dict[str, Any]:
+        """Judge a run by its force, its bounds and what rings; return the figures of the last two."""
+        self._judge_force(run, target, judge)
         violation, signal = self._find_violation(run)
-        kind, text = self._judge_force(run, np.array([step.target_N for step in steps]))
-        if not kind and violation > self.tolerance:
-            kind, text = OVER_BOUND, f"{signal} leaves its bounds by {violation:.1%} of half their width"
-        ring, lasting = self._find_ring(run)
-        if not kind and lasting:
-            kind, text = RINGS, lasting
-        current = np.array([step.current_A for step in steps])  # before the amplifier rounds it
-        slews = np.abs(np.diff(current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
-        at_limit = int(np.count_nonzero(slews | (np.abs(current) > mpc.command_limit * (1.0 - 1e-6))))
-        return _Outcome(kind=kind, text=text, violation=violation, signal=signal, ring=ring, at_limit=at_limit)
+        beyond = f"{signal} leaves its bounds by {violation:.1%} of half their width"
+        judge.require(OVER_BOUND, violation, self.tolerance, beyond)
+        return {"violation": violation, "signal": signal, "ring": self._judge_ring(run, judge)}
 
     def _simulate(self, steps: list[MPCStep]) -> ForceRun:
         """Return the samples of the run, and add each step of the law to `steps`. An outer loop is given what it makes
@@ -320,47 +320,44 @@ class _Case:
             seed=self.drawn.seed,
         )
 
-    def _judge_force(self, run: ForceRun, target: Signal) -> tuple[str, str]:
-        """Return what is wrong with the force of a run, a kind and a sentence; "" twice where nothing is."""
+    def _judge_force(self, run: ForceRun, target: Signal, judge: Judge) -> None:
+        """Ask that the force stays within what the limits hold, comes to rest and, of a link that is held, settles."""
         mpc = self.mpc
         limit = abs(mpc.static_gain) * mpc.command_limit
         _, phase, lasting = _count_samples(mpc)
-        peak = float(np.max(np.abs(run.force)))
-        if not peak < RUNAWAY * limit:
-            return DIVERGED, f"{peak:.4g} {run.unit}, and the limits hold {limit:.4g} {run.unit}"
-        off = np.abs(run.force - target)
-        first, second = np.max(off[-lasting : -lasting // 2]), np.max(off[-lasting // 2 :])
-        if second > GROWTH * first + SETTLED * limit:
-            return DIVERGED, f"the error grows to {second:.4g} {run.unit} over the last phase"
+        peak, off = float(np.max(np.abs(run.force))), np.abs(run.force - target)
+        held = f"{peak:.4g} {run.unit}, and the limits hold {limit:.4g} {run.unit}"
+        judge.require(DIVERGED, peak, RUNAWAY * limit, held, run.unit)
+        first, second = np.max(off[-lasting : -lasting // 2]), float(np.max(off[-lasting // 2 :]))
+        grows = f"the error grows to {second:.4g} {run.unit} over the last phase"
+        judge.require(DIVERGED, second, GROWTH * first + SETTLED * limit, grows, run.unit)
         if self.stage.plant.moves:
-            return "", ""
-        last = max(round(LAST_SHARE * phase), 1)
+            return
         end_of_step = run.time.size - lasting - mpc.spec.preview_samples  # before its end the next phase is known
-        for end in (run.time.size, end_of_step, end_of_step - phase):
-            error = float(np.mean(off[end - last : end]))
-            if error > SETTLED * abs(run.reference[-1]):
-                return UNSETTLED, f"{error:.4g} {run.unit} off {end / run.time.size:.0%} into the run"
-        return "", ""
+        ends = (run.time.size, end_of_step, end_of_step - phase)
+        for end, errors in zip(ends, take_ends(off, ends, max(round(LAST_SHARE * phase), 1)), strict=True):
+            error = float(np.mean(errors))
+            text = f"{error:.4g} {run.unit} off {end / run.time.size:.0%} into the run"
+            judge.require(UNSETTLED, error, SETTLED * abs(float(run.reference[-1])), text, run.unit)
 
-    def _find_ring(self, run: ForceRun) -> tuple[float, str]:
-        """Return the peak of what swings at the end of a run, 0 for nothing, and a sentence where it is a fault. What
-        rounding makes comes and goes, so that half of the runs that ring look as if they died out. What dies out is
-        therefore no fault only where the same run on ideal devices has as much of it.
+    def _judge_ring(self, run: ForceRun, judge: Judge) -> float:
+        """Judge what swings at the end of a run; return its peak, 0 for nothing. What rounding makes comes and goes, so
+        that half of the runs that ring look as if they died out. What dies out is therefore no fault only where the
+        same run on ideal devices has as much of it.
         """
         view = view_loop(self.stage, self.stage.plant, self.values)
         swing = self._measure_ring(run, view)
         fading = not (swing.sustained or swing.growing)
         if fading and self.is_ideal:
-            return 0.0, ""
-        floor = find_noise_floor(self.stage, float(np.max(np.abs(run.force))))
-        if not view.instability:
-            floor = max(floor, LINE_SIGMAS * view.force_std(SLOWEST * self.mpc.spec.bandwidth_hz))
-        if swing.amplitude <= floor:
-            return swing.peak, ""
-        if fading and not self._rings_by_devices(swing.amplitude, view):
-            return 0.0, ""
+            return 0.0
+        peak, lowest_hz = float(np.max(np.abs(run.force))), SLOWEST * self.mpc.spec.bandwidth_hz
+        floor = find_noise_floor(self.stage, peak, view, lowest_hz)
+        if fading and swing.amplitude > floor and not self._rings_by_devices(swing.amplitude, view):
+            return 0.0
         what = f"an oscillation of {swing.amplitude:.3g} {run.unit}, at {swing.frequency_hz:.3g} Hz most, "
-        return swing.peak, f"{what}does not die out; noise and rounding explain {floor:.3g} {run.unit}"
+        text = f"{what}does not die out; noise and rounding explain {floor:.3g} {run.unit}"
+        judge.require(RINGS, swing.amplitude, floor, text, run.unit)
+        return swing.peak
 
     def _rings_by_devices(self, amplitude: float, view: LinearView) -> bool:
         """Tell whether most of what swings is gone with ideal devices, so that it is no transient of the loop."""
@@ -388,29 +385,17 @@ class _Case:
 
     def _find_violation(self, run: ForceRun) -> tuple[float, str]:
         """Return by how much a bounded signal leaves its bounds at most, over half their width, and which it is."""
-        mpc, plant = self.mpc, self.stage.plant
-        worst, signal = 0.0, ""
-        completed = plant.complete(self.values)
-        delay_s = float(find_delay(plant, read_conditions(plant, self.values)))
-        whole, rest_s = whole_samples(delay_s, mpc.sample_time_s)
-        late = mpc.compute_delay_samples + whole + (rest_s > 0.0)  # of what acts as a sample is read
-        inputs = np.zeros((run.time.size, len(plant.inputs)))
-        inputs[:, 0] = np.append(np.zeros(late), run.current)[: run.time.size] + self.drawn.disturbance
-        outputs_of = output_function(plant).map(run.time.size)
-        outputs = np.array(outputs_of(run.time[None], run.state.T, inputs.T, ca.DM(completed.vector)))
-        traces = dict(zip(plant.states, run.state.T, strict=True)) | dict(zip(plant.outputs, outputs, strict=True))
-        for name, (low, high) in mpc.spec.bounds.items():
-            if not _has(plant, name):
-                continue
-            if name in traces:
-                trace = traces[name]
-            else:
-                trace = run.state @ deflection_row(plant, completed)
-                trace = np.gradient(trace, mpc.sample_time_s) if name == "spring_rate" else trace
-            beyond = float(np.max(np.maximum(low - trace, trace - high))) / (0.5 * (high - low))
-            if beyond > worst:
-                worst, signal = beyond, name
-        return worst, signal
+        plant, traces = self.stage.plant, dict[str, Signal]()
+        if plant.spring is not None:
+            stretch = run.state @ deflection_row(plant, plant.complete(self.values))
+            traces = {"spring_deflection": stretch, "spring_rate": np.gradient(stretch, self.mpc.sample_time_s)}
+        traces |= {**dict(zip(plant.states, run.state.T, strict=True)), **run.outputs}
+        bounds = {name: ends for name, ends in self.mpc.spec.bounds.items() if name in traces}
+        beyond = [
+            (float(np.max(np.maximum(low - traces[name], traces[name] - high))) / (0.5 * (high - low)), name)
+            for name, (low, high) in bounds.items()
+        ]
+        return max((case for case in beyond if case[0] > 0.0), default=(0.0, ""), key=lambda case: case[0])
 
 
 def measure_constrained(survey: Survey, progress: Progress) -> Evidence:
@@ -450,14 +435,14 @@ def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
     for k in count_off(range(runs), "limits active, run", progress):
         of_plants = dict(zip(plants, next(played), strict=True))
         outcomes += of_plants.values()
-        failed = next((name for name, outcome in of_plants.items() if outcome.kind), None)
-        kinds.append("" if failed is None else of_plants[failed].kind)
-        if failed is not None and not failed_run:
+        failed, fault = next(((name, each.fault) for name, each in of_plants.items() if each.fault), ("", None))
+        kinds.append("" if fault is None else fault.kind)
+        if fault is not None and not failed_run:
             stage, draw, outcome = stages[failed], parts[k].draw, of_plants[failed]
             has = place_values(stage.plant, unknown.nominal, draw)
             used, case = {key: draw[key] for key in draw if key in has}, _place_run(shared.value, stage, parts[k])
             remedy = _find_remedy(case, failed, unknown.nominal, used, outcome)
-            failed_run.update(plant=failed, run=str(k + 1), text=outcome.text, parameters=used, remedy=remedy)
+            failed_run.update(plant=failed, run=str(k + 1), text=fault.text, parameters=used, remedy=remedy)
     failures, steps = sum(map(bool, kinds)), max(sum(outcome.steps for outcome in outcomes), 1)
     missing = (
         f"{name} has no {signal}: its bounds are not checked there"
@@ -524,21 +509,21 @@ def _play_run(shared: Shared[_Staged], run: _RunDraw) -> list[_Outcome]:
 def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[str, float], failed: _Outcome) -> str:
     """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
     mpc, plant = case.mpc, case.stage.plant
-    over_bound = failed.kind == OVER_BOUND
+    over_bound = failed.fault is not None and failed.fault.kind == OVER_BOUND
 
     def fails(values: ParameterSet) -> bool:
-        return bool(replace(case, values=values).play().kind)
+        return replace(case, values=values).play().fault is not None
 
     if failed.late:
         return f"a larger max_iterations in [mpc]: {format_count(failed.late, 'sample')} of that run had no plan"
     # Of a bound the room that it needs is named.
-    if not over_bound and not case.is_ideal and not case.ideal.play().kind:
+    if not over_bound and not case.is_ideal and case.ideal.play().fault is None:
         return (
             "finer sensors of less offset and more range, a finer command_step, or a lower bandwidth_hz: with ideal "
             "ones that run passes"
         )
     design, values = mpc.design
-    if (of_design := replace(case, stage=replace(case.stage, plant=design), values=values).play()).kind:
+    if (of_design := replace(case, stage=replace(case.stage, plant=design), values=values).play()).fault:
         return f"{_name_obstacle(mpc, of_design)}: the run fails on the design plant with its own parameters too"
     room = f", or leave {failed.signal} more room by bound_tolerance" if over_bound else ""
     at_nominal = place_values(plant, nominal, {})
@@ -555,7 +540,7 @@ def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[st
 
 def _name_obstacle(mpc: ForceMPC, failed: _Outcome) -> str:
     """Return what of the specification is in the way of a run on the plant that it was made for."""
-    if failed.kind != OVER_BOUND:
+    if failed.fault is None or failed.fault.kind != OVER_BOUND:
         return "a lower bandwidth_hz, or a longer horizon_s in [mpc]"
     low, high = mpc.spec.bounds[failed.signal]
     more = 0.5 * (high - low) * failed.violation

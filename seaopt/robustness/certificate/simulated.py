@@ -309,11 +309,11 @@ def _list_failures(runs: Verification, rows: Sequence[Outcome]) -> list[Requirem
     requirements: list[Requirement] = []
     for kind, cases in faults.items():
         fault, row = max(cases, key=lambda case: case[0].value / (case[0].limit or 1.0))
-        name, value, unit = SIMULATION_FAILURES, float(len(cases)), ""
+        name, value, limit, unit = SIMULATION_FAILURES, float(len(cases)), 0.0, ""
         if kind in NAMED_FAULTS:
-            name, value, unit = NAMED_FAULTS[kind], fault.value, fault.unit
+            name, value, limit, unit = NAMED_FAULTS[kind], fault.value, fault.limit, fault.unit
         words = {"text": fault.text, "remedy": fault.remedy, "count": len(cases), "unit": unit}
-        requirements.append(replace(_require(runs, row, name, value, fault.limit, **words), met=False))
+        requirements.append(replace(_require(runs, row, name, value, limit, **words), met=False))
     return requirements
 
 

@@ -21,6 +21,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, find_dry_friction
 from seaopt.plants.plant import output_function
 from seaopt.records import record
+from seaopt.robustness.verification.judgement import find_saturated, take_ends
 from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.playback import Stage, play
 from seaopt.robustness.verification.scenarios import NOMINAL_EFFORT, Phase, Scenario
@@ -82,15 +83,16 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
         size = min(effort / outer.stiffness, farthest)
         push = Phase(duration_s=samples * outer.sample_time_s, force_N=outer.direction * outer.stiffness * size)
         scenario = Scenario(name="step of x_0", phases=(push,), friction="sticking" if can_stick(plant) else "smooth")
-        run, limit = play(stage, scenario, [params]), stage.law.command_limit * (1.0 - 1e-9)
-        steps.append(_judge(run.outputs[motion][0], size, bool(np.max(np.abs(run.current)) >= limit)))
+        run = play(stage, scenario, [params])
+        saturated = find_saturated(run.current, stage.law.command_limit) > 0.0
+        steps.append(_measure(run.outputs[motion][0], size, saturated))
     return tuple(steps)
 
 
-def _judge(path: Signal, size: float, saturated: bool) -> ImpedanceStep:
+def _measure(path: Signal, size: float, saturated: bool) -> ImpedanceStep:
     if not np.all(np.isfinite(path)):
         return ImpedanceStep(size=size, moving=np.inf, end=np.nan, overshoot=np.nan, saturated=saturated)
-    last = path[int((1.0 - LAST_SHARE) * path.size) :]
+    last = take_ends(path, [path.size], path.size - int((1.0 - LAST_SHARE) * path.size))
     end = float(np.mean(last))
     return ImpedanceStep(
         size=size,

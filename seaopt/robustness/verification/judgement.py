@@ -1,6 +1,7 @@
-"""The judgement of each simulated run, for verification: its figures, and whether they are allowed.
+"""The judge of every simulated run: its figures, and whether they are allowed.
 
-A run passes if:
+A `Judge` is asked check after check by whoever has a run: of a scenario here, of sweeps and pushes of a schedule, of
+predictive control with its limits active. A run of a scenario passes if:
 
 - it stays finite, and the current stays within the limit, rounded down to a whole step of the amplifier;
 - the linear loop of the last phase is stable (`linear`). An unstable one may still settle by luck, on a step of the
@@ -34,6 +35,7 @@ from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.codec import Key, OrInfinite, OrNaN
 from seaopt.control.running.closed_loop import ENERGY
@@ -51,6 +53,7 @@ SETTLE = 0.2  # of the last phase, which is not judged
 GROWTH, GROWTH_FLOOR = 1.05, 1e-3
 ROUNDING = 1e-24  # of the largest energy or square of an error, below which it is rounding: neither grows nor decays
 OUTBREAK, OUTLIER = 2.0, 6.0
+AT_LIMIT = ABOVE_LIMIT = 1e-9  # shares of the limit: rounding of a command that is at it
 LINE_SIGMAS = 4.0  # standard deviations of noise that a line in its spectrum stays below: the amplitude is Rayleigh's
 MEAN_SIGMAS = 4.0  # standard deviations that a mean of noise stays below
 LEAST_WINDOW_S = 3.0
@@ -157,15 +160,35 @@ class Outcome(Result):
 
 
 @record
-class _Findings:
-    """Figures of one run, as fields of an `Outcome`, and what is not allowed."""
+class Judge:
+    """What is asked of one run, check after check: its figures, and a fault for each that is more than it may be."""
 
     figures: dict[str, Any] = field(default_factory=dict[str, Any])
     faults: list[Fault] = field(default_factory=list[Fault])
 
-    def add(self, kind: str, text: str, **figure: Any) -> None:
-        """Add a fault, its figure as the fields of a `Fault`."""
-        self.faults.append(Fault(kind=kind, text=text, **figure))
+    def require(self, kind: str, value: float, most: float, text: str, unit: str = "", remedy: str = "") -> None:
+        """Ask that a value is at most what is allowed; the text says what is wrong with one that is not."""
+        if not value <= most:
+            self.faults.append(Fault(kind=kind, text=text, value=value, limit=most, unit=unit, remedy=remedy))
+
+    def refuse(self, kind: str, text: str, remedy: str = "") -> None:
+        """Add a fault that has no figure, where there is a text."""
+        self.require(kind, float(bool(text)), 0.0, text, remedy=remedy)
+
+    @property
+    def first(self) -> str:
+        """What is wrong in the first place; empty where nothing is."""
+        return str(self.faults[0]) if self.faults else ""
+
+
+def take_ends(signal: Signal, ends: Sequence[int], length: int) -> Float[np.ndarray, "k n"]:
+    """Return the last samples of the phases of a run that end there, of which is judged what has settled."""
+    return np.array([signal[end - length : end] for end in ends])
+
+
+def find_saturated(command: Float[np.ndarray, "..."], limit: float) -> float:
+    """Return the share of the samples at which a command is at its limit."""
+    return float(np.mean(np.abs(command) >= limit * (1.0 - AT_LIMIT)))
 
 
 @record(eq=False)
@@ -236,82 +259,80 @@ def judge_run(
     same scenario on `stage.ideal`; the trace itself where the stage is ideal. `unlimited` is that one without a current
     limit, where it `overshoots_at_limit`.
     """
-    findings, drawn, nominal = _Findings(), sets[index], sets[0]
+    judge, drawn, nominal = Judge(), sets[index], sets[0]
     view = linearise_last_phase(stage, scenario, drawn)
-    if view.instability:
-        findings.add("unstable", view.instability)
     run = _Run(stage=stage, scenario=scenario, trace=trace, index=index)
     ideal = replace(run, trace=twin)
-    _judge_extremes(run, findings)
-    _judge_rest(run, drawn, findings)
-    if all(np.all(np.isfinite(signal)) for signal in (run.force, trace.current[index], ideal.force)):
+    finite = all(np.all(np.isfinite(signal)) for signal in (run.force, trace.current[index], ideal.force))
+    judge.refuse("overflow", "" if finite else "its numbers overflow")
+    judge.refuse("unstable", view.instability)
+    _judge_extremes(run, judge)
+    _judge_rest(run, drawn, judge)
+    if finite:
         if scenario.friction == "smooth" or scenario.settling_s is None:
-            _judge_growth(ideal, findings)
+            _judge_growth(ideal, judge)
         if not view.instability and twin is not trace:
-            _judge_outbreak(run, ideal, view, findings)
+            _judge_outbreak(run, ideal, view, judge)
         if scenario.quiet:
-            _judge_oscillation(run, drawn, view, findings)
+            _judge_oscillation(run, drawn, view, judge)
         if scenario.settling_s is not None:
-            _judge_step(ideal, scenario.settling_s, findings, unlimited)
-        _judge_final_error(run, ideal, findings)
-    else:
-        findings.faults.insert(0, Fault(kind="overflow", text="its numbers overflow"))
+            _judge_step(ideal, scenario.settling_s, judge, unlimited)
+        _judge_final_error(run, ideal, judge)
     return Outcome(
         scenario=scenario.name,
         plant=name,
         draw=NOMINAL if index == 0 else str(index),
-        faults=tuple(findings.faults),
+        faults=tuple(judge.faults),
         parameters={n: p.value for n, p in drawn.items() if n not in nominal or p.value != nominal[n].value},
-        **findings.figures,
+        **judge.figures,
     )
 
 
-def _judge_extremes(run: _Run, findings: _Findings) -> None:
+def _judge_extremes(run: _Run, judge: Judge) -> None:
     scenario, trace, index, command = run.scenario, run.trace, run.index, run.stage.controller.command
     force = float(trace.peaks[run.regulated][index])
     angles = [float(trace.peaks[name][index]) for name, unit in run.stage.plant.outputs.items() if unit == "rad"]
-    current, limit = np.abs(trace.current[index]), run.stage.controller.command_limit
+    current, limit = float(np.max(np.abs(trace.current[index]))), run.stage.controller.command_limit
     most = largest_current(math.inf if limit is None else limit, run.stage.command_step)
     hardest = max(trace.contacts, key=lambda contact: abs(contact.impulse[index]), default=None)
-    findings.figures.update(
+    judge.figures.update(
         peak_force_N=force,
-        peak_current_A=float(np.max(current)),
+        peak_current_A=current,
         peak_angle_rad=max(angles) if angles else None,
-        saturated=float(np.mean(current >= most * (1 - 1e-9))),
+        saturated=find_saturated(trace.current[index], most),
         peak_energy_J=float(trace.peaks[ENERGY][index]) if ENERGY in trace.peaks else None,
         contact_impulse=None if hardest is None else float(hardest.impulse[index]),
         contact_loss_J=None if hardest is None else float(hardest.loss_J[index]),
     )
-    if trace.faulted[index]:
-        remedy = "a larger max_step_N, max_held or range_N in [controller.gate], or no agreement"
-        findings.faults.append(Fault(kind="gate", text="the gate takes a true reading for a fault", remedy=remedy))
-    if np.max(current) > most * (1 + 1e-9):
-        reached = f"the {command.word} reaches {command.show(np.max(current))}"
-        findings.add("current", f"{reached}, above its limit of {command.show(most)}")
+    remedy = "a larger max_step_N, max_held or range_N in [controller.gate], or no agreement"
+    judge.refuse("gate", "the gate takes a true reading for a fault" if trace.faulted[index] else "", remedy)
+    text = f"the {command.word} reaches {command.show(current)}, above its limit of {command.show(most)}"
+    judge.require("current", current, most * (1.0 + ABOVE_LIMIT), text, command.unit)
     for what, value, allowed, unit in (
         (run.regulated, force, scenario.max_force_N, run.unit),
         ("the angle", max(angles, default=0.0), scenario.max_angle_rad, "rad"),
     ):
-        if allowed is not None and not value <= allowed:
-            findings.add(f"peak of {what}", f"{what} reaches {value:.4g} {unit}, {allowed:g} {unit} are allowed")
+        if allowed is not None:
+            text = f"{what} reaches {value:.4g} {unit}, {allowed:g} {unit} are allowed"
+            judge.require(f"peak of {what}", value, allowed, text, unit)
     for name, value in scenario.passes.items():
         output = trace.outputs[name][index]
-        if not np.nanmin(output) <= value <= np.nanmax(output):
-            findings.add("no event", f"{name} never passes {value:g}, so that the scenario does not happen")
+        missed = max(np.nanmin(output) - value, value - np.nanmax(output))
+        judge.require("no event", missed, 0.0, f"{name} never passes {value:g}, so that the scenario does not happen")
 
 
-def _judge_rest(run: _Run, drawn: ParameterSet, findings: _Findings) -> None:
+def _judge_rest(run: _Run, drawn: ParameterSet, judge: Judge) -> None:
     """Check that the motor can hold the plant where the draw puts it at rest."""
-    controller, rest = run.stage.controller, run.trace.rest
-    limit, show = controller.command_limit, controller.command.show
-    if rest is None or limit is None or abs(rest.current_A[run.index]) <= limit * (1 + 1e-9):
+    rest, limit, command = run.trace.rest, run.stage.controller.command_limit, run.stage.controller.command
+    if rest is None or limit is None:
         return
+    takes = abs(float(rest.current_A[run.index]))
     where = format_values({name: drawn[name].value for name in run.stage.plant.states if name in drawn}, missing="")
-    text = f"to rest at {where} takes {show(rest.current_A[run.index])}, above the limit of {show(limit)}"
-    findings.add("rest", text, remedy="narrow its range")
+    text = f"to rest at {where} takes {command.show(takes)}, above the limit of {command.show(limit)}"
+    judge.require("rest", takes, limit * (1.0 + ABOVE_LIMIT), text, command.unit, remedy="narrow its range")
 
 
-def _judge_growth(run: _Run, findings: _Findings) -> None:
+def _judge_growth(run: _Run, judge: Judge) -> None:
     trace = run.trace
     if ENERGY in trace.outputs:
         base = 0.0 if trace.rest is None or not run.scenario.about_rest else trace.rest.energy_J[run.index]
@@ -326,22 +347,22 @@ def _judge_growth(run: _Run, findings: _Findings) -> None:
     first, second = (float(np.max(half)) for half in np.array_split(last, 2))
     largest = float(np.max(level))
     growth = second / max(first, 1e-300) if second > ROUNDING * largest else 0.0
-    findings.figures["energy_growth"] = growth
-    if second > GROWTH * first + GROWTH_FLOOR * largest:
-        findings.add("growth", f"{what} grows {growth:.3g} times while the reference is constant")
+    judge.figures["energy_growth"] = growth
+    text = f"{what} grows {growth:.3g} times while the reference is constant"
+    judge.require("growth", second, GROWTH * first + GROWTH_FLOOR * largest, text)
 
 
-def _judge_outbreak(run: _Run, ideal: _Run, view: LinearView, findings: _Findings) -> None:
+def _judge_outbreak(run: _Run, ideal: _Run, view: LinearView, judge: Judge) -> None:
     """Check that noise does not set off a growing force error."""
     off, alone, last = np.abs(run.error), float(np.max(np.abs(ideal.error))), run.trace.last
     half = last.stop - (last.stop - last.start) // 2
     before, after = max(float(np.max(off[:half])), alone), float(np.max(off[half:]))
-    if not after <= OUTBREAK * before + OUTLIER * view.force_std():
-        end = f"{after:.4g} {run.unit} in the end, without noise by {alone:.4g} {run.unit}"
-        findings.add("outbreak", f"{run.regulated} is off by up to {end}")
+    end = f"{after:.4g} {run.unit} in the end, without noise by {alone:.4g} {run.unit}"
+    most = OUTBREAK * before + OUTLIER * view.force_std()
+    judge.require("outbreak", after, most, f"{run.regulated} is off by up to {end}", run.unit)
 
 
-def _judge_oscillation(run: _Run, drawn: ParameterSet, view: LinearView, findings: _Findings) -> None:
+def _judge_oscillation(run: _Run, drawn: ParameterSet, view: LinearView, judge: Judge) -> None:
     """Check that no oscillation lasts: a slow one in a long window, one whose phase noise moves in a short one."""
     stage, scenario = run.stage, run.scenario
     band, period = stage.controller.spec.bandwidth_hz, stage.controller.sample_time_s
@@ -352,19 +373,17 @@ def _judge_oscillation(run: _Run, drawn: ParameterSet, view: LinearView, finding
         window = slice(max(last.start, last.stop - length), last.stop)
         lasting = period * (window.stop - window.start)
         lowest = max(band / SLOWEST, LINE_PERIODS / lasting) if free else STILL_PERIODS / lasting
-        floor = find_noise_floor(stage, float(run.trace.peaks[run.regulated][run.index]))
+        floor = find_noise_floor(stage, float(run.trace.peaks[run.regulated][run.index]), view, lowest)
         if scenario.settling_s is not None:  # what creeps against friction is no pure exponential
             floor = max(floor, VISIBLE * abs(run.step))
-        if not view.instability:
-            floor = max(floor, LINE_SIGMAS * view.force_std(lowest))
         line = find_oscillation(run.force[window], period, floor=floor, lowest_hz=lowest)
         if line is None or (not line.growing and _swings_alone(run, drawn, line.frequency_hz)):
             continue
         if line.sustained or line.growing:
-            findings.figures.update(limit_cycle_N=line.amplitude, limit_cycle_hz=line.frequency_hz)
+            judge.figures.update(limit_cycle_N=line.amplitude, limit_cycle_hz=line.frequency_hz)
             what = "sustains itself" if line.sustained else f"grows {line.growth:.3g} times"
             text = f"an oscillation of {line.amplitude:.3g} {run.unit} at {line.frequency_hz:.4g} Hz {what}"
-            findings.add("oscillation", text, value=line.amplitude, unit=run.unit)
+            judge.require("oscillation", line.amplitude, 0.0, text, run.unit)
             return
 
 
@@ -382,11 +401,14 @@ def find_judged_window(trace: Playback) -> slice:
     return slice(last.start + int(SETTLE * (last.stop - last.start)), last.stop)
 
 
-def find_noise_floor(stage: Stage, peak: float) -> float:
-    """Return the amplitude (N) that noise, quantisation and rounding make without an oscillation in a run's peak."""
+def find_noise_floor(stage: Stage, peak: float, view: LinearView, lowest_hz: float) -> float:
+    """Return the amplitude (N) above a frequency that noise, quantisation and rounding make without an oscillation in a
+    run's peak; of an unstable loop there is no telling what it makes of them.
+    """
     rounding = 0.5 * stage.command_step / stage.controller.command.per_effort
     std, step = stage.reading_errors
-    return max(2.0 * std + 1.5 * step + rounding, 1e-3 * peak)
+    noise = 0.0 if view.instability else LINE_SIGMAS * view.force_std(lowest_hz)
+    return max(2.0 * std + 1.5 * step + rounding, 1e-3 * peak, noise)
 
 
 def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bool:
@@ -394,47 +416,44 @@ def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bo
     limit, allowed = stage.controller.command_limit, scenario.max_overshoot
     if limit is None or allowed is None:
         return False
-    at_limit = np.flatnonzero(np.max(np.abs(trace.current), axis=1) >= limit * (1 - 1e-9))
-    runs = (_Run(stage=stage, scenario=scenario, trace=trace, index=int(index)) for index in at_limit)
+    at_limit = (index for index, current in enumerate(trace.current) if find_saturated(current, limit))
+    runs = (_Run(stage=stage, scenario=scenario, trace=trace, index=index) for index in at_limit)
     return any(run.largest > allowed for run in runs)
 
 
-def _judge_step(run: _Run, most_s: float, findings: _Findings, unlimited: Playback | None) -> None:
+def _judge_step(run: _Run, most_s: float, judge: Judge, unlimited: Playback | None) -> None:
     """Judge a step from rest by its largest force, between samples too, and by when it has settled."""
     last, largest, allowed = run.trace.last, run.largest, run.scenario.max_overshoot
     outside = np.flatnonzero(np.abs(run.response[last] - 1.0) > SETTLED)
     settled = outside.size == 0 or outside[-1] + 1 < last.stop - last.start
     samples = float(outside[-1] + 1 if outside.size else 0) if settled else math.inf
     settling_s = samples * run.stage.controller.sample_time_s
-    findings.figures.update(overshoot=max(largest - 1.0, 0.0), settling_s=settling_s)
+    judge.figures.update(overshoot=max(largest - 1.0, 0.0), settling_s=settling_s)
     step = f"a step of {run.step:.3g} {run.unit}"
-    if allowed is not None and largest > allowed:
-        by_limit = unlimited is not None and replace(run, trace=unlimited).largest <= allowed
-        findings.figures.update(overshoot_by_limit=by_limit)
-        if not by_limit:
-            over, most = (f"{100.0 * (share - 1.0):.3g} %" for share in (largest, allowed))
-            remedy = SLOWER_INTEGRAL if run.scenario.friction == "sticking" else ""
-            text = f"{step} overshoots by {over}, {most} are allowed"
-            findings.add("overshoot", text, value=largest, limit=allowed, remedy=remedy)
-    if settling_s > most_s:
-        when = f"after {settling_s:.4g} s" if settled else "not at all"
-        text = f"{step} settles {when}, {most_s:.4g} s are allowed"
-        findings.add("settling", text, value=settling_s, limit=most_s, unit="s")
+    if allowed is not None and largest > allowed and unlimited is not None:
+        judge.figures["overshoot_by_limit"] = replace(run, trace=unlimited).largest <= allowed
+    if allowed is not None and not judge.figures.get("overshoot_by_limit"):
+        over, most = (f"{100.0 * (share - 1.0):.3g} %" for share in (largest, allowed))
+        remedy = SLOWER_INTEGRAL if run.scenario.friction == "sticking" else ""
+        text = f"{step} overshoots by {over}, {most} are allowed"
+        judge.require("overshoot", largest, allowed, text, remedy=remedy)
+    when = f"after {settling_s:.4g} s" if settled else "not at all"
+    judge.require("settling", settling_s, most_s, f"{step} settles {when}, {most_s:.4g} s are allowed", "s")
 
 
-def _judge_final_error(run: _Run, ideal: _Run, findings: _Findings) -> None:
+def _judge_final_error(run: _Run, ideal: _Run, judge: Judge) -> None:
     last, stage, most = run.trace.last, run.stage, run.scenario.final_error
-    end = slice(last.stop - max(1, (last.stop - last.start) // 5), last.stop)
-    error, alone = (float(np.mean(each.error[end])) for each in (run, ideal))
-    findings.figures["final_error_N"] = error
+    judged = max(1, (last.stop - last.start) // 5)
+    error, alone = (float(np.mean(take_ends(each.error, [last.stop], judged))) for each in (run, ideal))
+    judge.figures["final_error_N"] = error
     if most is None:
         return
-    (noise, count), rounding = stage.reading_errors, stage.command_step / stage.controller.command.per_effort
-    spare = MEAN_SIGMAS * noise / math.sqrt(end.stop - end.start) + 0.5 * (count + rounding)
-    for value, allowed, what in ((error, most + spare, ""), (alone, most, " without noise")):
-        if not abs(value) <= allowed:
-            called, side = stage.controller.command.mechanics, "below" if value > 0.0 else "above"
-            ends = f"the {called.word} ends {abs(value):.4g} {called.unit} {side} its reference{what}"
-            text = f"{ends}, {allowed:.4g} {called.unit} are allowed"
-            findings.add("steady error", text, value=abs(value), limit=allowed, unit=called.unit)
-            return
+    called, (noise, count) = stage.controller.command.mechanics, stage.reading_errors
+    rounding = stage.command_step / stage.controller.command.per_effort
+    spare = MEAN_SIGMAS * noise / math.sqrt(judged) + 0.5 * (count + rounding)
+    noisy = not abs(error) <= most + spare
+    value, allowed, what = (error, most + spare, "") if noisy else (alone, most, " without noise")
+    side = "below" if value > 0.0 else "above"
+    ends = f"the {called.word} ends {abs(value):.4g} {called.unit} {side} its reference{what}"
+    text = f"{ends}, {allowed:.4g} {called.unit} are allowed"
+    judge.require("steady error", abs(value), allowed, text, called.unit)

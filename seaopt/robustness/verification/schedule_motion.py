@@ -33,9 +33,10 @@ from seaopt.errors import SimulationError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
+from seaopt.robustness.verification.judgement import Judge, take_ends
 from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import SETTLED
-from seaopt.robustness.verification.schedule_sweep import RestStart, find_least_effort, find_loss
+from seaopt.robustness.verification.schedule_sweep import RestStart, find_least_effort
 
 PUSHES, ROUNDS = (1.0, -1.0, -1.0, 1.0), 3
 LEAST_PERIODS, MOST_PERIODS, JUDGED_PERIODS = 5, 20, 2  # of the least bandwidth: of a push, and of its end
@@ -93,7 +94,7 @@ class _Pushing:
         """Return the push that moves the variable at a rate, or as fast as it may; None where even small ones fail. And
         how larger ones were lost, where that ends the search.
         """
-        size, kept, law, loss = first, None, self.schedule.runnable(), ""
+        size, kept, limit, loss = first, None, self.schedule.runnable().command_limit, ""
         for _ in range(TRIES):
             try:
                 run = self.start.run(self.plant, self.start.params, size * self.pushes[None])
@@ -103,11 +104,9 @@ class _Pushing:
                     run=run,
                     rate=float(np.max(np.abs(np.diff(place)))) / self.schedule.spec.sample_time_s,
                     room=float(np.max(np.abs(place - self.middle))) / self.room,
-                    command=float(np.max(np.abs(run.current))) / law.command_limit,
+                    command=float(np.max(np.abs(run.current))) / limit,
                 )
                 share = max(NEAR * push.rate / rate, push.room, push.command)
-                loss = find_loss(run, law) or loss
-                share = LOST_SHARE if find_loss(run, law) else share
                 kept = push if share <= 1.0 else kept
             except SimulationError as error:
                 share, loss = LOST_SHARE, f"is lost: {error}"
@@ -118,8 +117,8 @@ class _Pushing:
 
     def measure(self, error: Signal) -> tuple[float, float]:
         """Return how large an error is at the ends of pushes, over their step, and its fast part."""
-        ends, judged = np.arange(self.lasting, self.pushes.size + 1, self.lasting), JUDGED_PERIODS * self.period
-        windows = np.array([error[end - judged : end] for end in ends])
+        ends, judged = range(self.lasting, self.pushes.size + 1, self.lasting), JUDGED_PERIODS * self.period
+        windows = take_ends(error, ends, judged)
         slow = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, judged), 3))[0]
         fast = windows - windows @ slow @ slow.T
         return 0.5 * float(np.max(np.abs(windows))), 0.5 * float(np.max(np.abs(fast)))
@@ -149,11 +148,11 @@ def move_schedule(
     most, most_ringing = (
         max(SETTLED, *(2.0 * each for each in values)) for values in zip((0.0, 0.0), *standing, strict=True)
     )
-    fault = ""
-    if not ringing <= most_ringing:
-        fault = f"rings: {100 * ringing:.3g} % of a push at its end, {100 * most_ringing:.3g} % allowed"
-    elif not left <= most:
-        fault = f"departs: a push is still {100 * left:.3g} % off at its end, {100 * most:.3g} % allowed"
+    judge = Judge()
+    rings = f"rings: {100 * ringing:.3g} % of a push at its end, {100 * most_ringing:.3g} % allowed"
+    judge.require("ringing", ringing, most_ringing, rings)
+    off = f"departs: a push is still {100 * left:.3g} % off at its end, {100 * most:.3g} % allowed"
+    judge.require("settling", left, most, off)
     return Motion(
         plant=name,
         asked=rate,
@@ -163,7 +162,7 @@ def move_schedule(
         size=size,
         left=left,
         ringing=ringing,
-        fault=fault,
+        fault=judge.first,
         lost=loss if push.rate < rate else "",
     )
 

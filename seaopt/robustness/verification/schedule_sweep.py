@@ -48,6 +48,7 @@ from seaopt.plants.memo import memo
 from seaopt.plants.plant import output_function
 from seaopt.progress import Progress, ignore
 from seaopt.records import record
+from seaopt.robustness.verification.judgement import Judge, find_saturated, take_ends
 from seaopt.robustness.verification.oscillation import Signal
 from seaopt.robustness.verification.scenarios import PEAK_GRACE, SETTLED
 from seaopt.units import show_command
@@ -191,7 +192,7 @@ def _run_sweep(
 ) -> Sweep:
     """Simulate one sweep with pulses and without, and judge the difference."""
     schedule, name, plant, params, pulses = shared.value
-    law, low, high, ts = schedule.runnable(), schedule.points[0], schedule.points[-1], schedule.spec.sample_time_s
+    low, high, ts = schedule.points[0], schedule.points[-1], schedule.spec.sample_time_s
     omega = 2.0 * math.pi * frequency_hz
     count = max(LEAST_PULSES, math.ceil(1.0 / frequency_hz / (2 * pulses.samples * ts)))
     pulse = np.tile(np.repeat([1.0, 0.0], pulses.samples), count)
@@ -211,18 +212,15 @@ def _run_sweep(
     calm, moved = start.find_errors(run, place)
     response = (moved - calm) / pulses.size + pulse
     peak = float(max(np.max(response), 1.0 - np.min(response)))
-    ends = np.arange(pulse.size) % pulses.samples >= JUDGED_FROM * pulses.samples
-    left = float(np.max(np.abs(response - pulse)[ends]))
-    fault = find_loss(run, law)
-    if fault:
-        peak = left = math.inf
-    elif np.max(np.abs(run.current)) >= law.command_limit:
-        fault = "the motion takes the command to its limit"
-    elif not peak <= pulses.allowed_peak:
-        fault = f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"
-    elif not left <= pulses.allowed_left:
-        fault = f"a step is still {100 * left:.3g} % off at its end, {100 * pulses.allowed_left:.3g} % allowed"
-    return make_sweep(peak=peak, left=left, fault=fault)
+    ends = range(pulses.samples, pulse.size + 1, pulses.samples)
+    left = float(np.max(np.abs(take_ends(response - pulse, ends, int((1.0 - JUDGED_FROM) * pulses.samples)))))
+    judge, saturated = Judge(), find_saturated(run.current, schedule.runnable().command_limit)
+    judge.require("limit", saturated, 0.0, "the motion takes the command to its limit")
+    reached = f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"
+    judge.require("overshoot", peak, pulses.allowed_peak, reached)
+    off = f"a step is still {100 * left:.3g} % off at its end, {100 * pulses.allowed_left:.3g} % allowed"
+    judge.require("settling", left, pulses.allowed_left, off)
+    return make_sweep(peak=peak, left=left, fault=judge.first)
 
 
 @record(eq=False)
@@ -259,7 +257,7 @@ class RestStart:
     def run(self, plant: Plant, values: ParameterSet, references: Rows, places: Signal | float = math.nan) -> LoopRun:
         """Return runs of the loop from there, of a plant that has these states; references count from there, and
         `places` are for a plant that does not have the variable. Raises SimulationError: to hold it there takes
-        more than the command's limit.
+        more than the command's limit, the loop runs away, or the gate gives its sensor up.
         """
         law, value = self.schedule.runnable(outer=True), self.value
         if abs(self.command) > law.command_limit:
@@ -289,7 +287,12 @@ class RestStart:
         x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]
         count = len(references)
         start = LoopState(x=np.tile(x, (count, 1)), z=np.tile(z, (count, 1)))
-        return run_loop(loop, [values] * count, given, start=start, places=places)
+        run = run_loop(loop, [values] * count, given, start=start, places=places)
+        if not all(np.all(np.isfinite(rows)) for rows in (*run.outputs.values(), run.current)):
+            raise SimulationError("it runs away")
+        if np.any(find_faults(law, run.end.z)):
+            raise SimulationError("the gate gives its sensor up")
+        return run
 
     def find_errors(self, run: LoopRun, places: Signal) -> Rows:
         """Return how far the output is from what the law follows, the weight that it compensates included."""
@@ -326,13 +329,6 @@ def _weigh(law: RunnableSchedule, readings: Mapping[str, float], place: float) -
         return 0.0
     read = [readings.get(name, 0.0) for name in law.compensation.reads]
     return law.compensation.step(FORGOTTEN, 0.0, read, law.find_terms(place))[0]
-
-
-def find_loss(run: LoopRun, law: RunnableSchedule) -> str:
-    """Return how a loop was lost; empty where it was not."""
-    if not all(np.all(np.isfinite(rows)) for rows in (*run.outputs.values(), run.current)):
-        return "is lost: it runs away"
-    return "is lost: the gate gives its sensor up" if np.any(find_faults(law, run.end.z)) else ""
 
 
 @memo
