@@ -110,7 +110,8 @@ steps of several sizes and exported as C. Whether its certificate is met depends
 here, and run the whole table.
 
 - A law of your own is what it is: notch, prefilter and link feedforward of `[controller]` are not used.
-- A law designed on `frf:` has no model. It is simulated on the plants that it is certified on.
+- A law designed on `frf:` is simulated on the plants that it is certified on. What no response tells, heat, friction and the largest step of a reading, is of the model of the plant that was measured.
+- A sweep of predictive control has its linear region, in which no limit is active.
 - A sweep is run, and nothing of it is exported.
 - The impedance has a number for its damping: `"critical"` is refused where something in the loop swings more slowly than the link.
 

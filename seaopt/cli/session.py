@@ -18,7 +18,7 @@ from seaopt.cli.progress import LEAST_SHARE, show_progress
 from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_sources
 from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
-from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law, sweep
+from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law
 from seaopt.control.frontier.rows import FRONTIER_SCHEMA
 from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, warn_delays
 from seaopt.control.laws.stored import CONTROLLER_SCHEMA
@@ -36,7 +36,6 @@ from seaopt.logs import Log, write_log
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, Stages, read_problem
-from seaopt.problem.completion import find_outer
 from seaopt.problem.explained import adopt, find_explanation, say_adopted, say_unexplained
 from seaopt.problem.problem import WRITE_ONE
 from seaopt.problem.stages import (
@@ -49,6 +48,7 @@ from seaopt.problem.stages import (
     list_plants,
     score_problem,
     simulate_experiment,
+    sweep_problem,
     tune_problem,
 )
 from seaopt.progress import Progress, count_off, divide
@@ -423,36 +423,15 @@ class Session:
         self._keep(result)
 
     def _sweep(self, tell: Progress) -> None:
-        source, file = self.parameters(), self.problem.source
-        if self.problem.mpc is not None:
-            raise ProblemError(
-                f'{file}: a sweep tunes gains, and [controller] has structure = "mpc"; write structure = "pid" to sweep'
-            )
-        design = self.problem.design_plant
+        source, design = self.parameters(), self.problem.design_plant
         self.warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
-        design, robust_to = list_plants(self.problem, source)
-        if self.free_law and self.problem.designs_on_response:
-            raise ProblemError(
-                f"{file}: --free-law takes a model, and [controller] is designed on {self.problem.response_names[0]}; "
-                "leave --free-law out, or name a plant there"
-            )
-        schedule = self.problem.schedule
-        result = sweep(
-            design,
-            self.values(),
-            self._spec(),
-            self.bandwidths_hz,
-            robust_to,
-            over=None if schedule is None else schedule.over,
-            points=() if schedule is None else schedule.points,
-            outer=find_outer(self.problem, source),
-            draws=self.problem.draws(source),
-            free_law=self.free_law,
-            executor=self.executor,
-            progress=tell,
-        )
-        self.results["sweep"] = result
-        self._write("sweep", result.to_dict())
+        self._spec()
+        options = {"free_law": self.free_law, "executor": self.executor, "progress": tell}
+        result, plans = sweep_problem(self.problem, source, self.bandwidths_hz, **options)
+        content, self.results["sweep"] = result.to_dict(), result
+        for law, plan in zip(content["controllers"], plans, strict=False):  # of predictive control each with its plan
+            law["mpc"] = describe_mpc(plan)
+        self._write("sweep", content)
         self.written += write_frontier_figure(result, self.folder / "frontier")
 
     def _certify(self, tell: Progress) -> None:

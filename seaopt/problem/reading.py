@@ -23,7 +23,7 @@ from seaopt.problem.predictive import make_mpc_spec
 from seaopt.problem.problem import Problem
 from seaopt.problem.references import check_references
 from seaopt.problem.schema import ProblemTable
-from seaopt.robustness.certificate.constrained import linear_spec
+from seaopt.robustness.certificate.linear_region import linear_spec
 
 OF_DESIGN = ("controller", "impedance", "mpc", "robustness", "expect")  # tables that a fit does not read
 

@@ -16,11 +16,13 @@ from seaopt.control import (
     Controller,
     ControllerSpec,
     ForceMPC,
+    Frontier,
     GivenLaw,
     ScheduledController,
     assess,
     command_of,
     force_mpc,
+    sweep,
     tune,
     tune_schedule,
 )
@@ -44,7 +46,7 @@ from seaopt.problem.completion import (
     make_gate,
 )
 from seaopt.problem.problem import WRITE_ONE, Problem
-from seaopt.progress import Progress, ignore
+from seaopt.progress import Progress, count_off, ignore
 from seaopt.robustness import (
     Budget,
     Certificate,
@@ -53,6 +55,7 @@ from seaopt.robustness import (
     linear_controller,
     tune_certified,
 )
+from seaopt.robustness.certificate.linear_region import sweep_plans
 from seaopt.robustness.certificate.retuning.reserve import Look, keep_reserve, look_at_draws
 from seaopt.robustness.verification.verification import list_readings
 from seaopt.signals import Signal
@@ -249,6 +252,49 @@ def tune_problem(
         executor=executor,
         progress=progress,
     )
+
+
+def sweep_problem(
+    problem: Problem,
+    source: Fit | ParameterSet,
+    bandwidths_hz: Sequence[float],
+    *,
+    free_law: bool = False,
+    executor: Executor | None = None,
+    progress: Progress = ignore,
+) -> tuple[Frontier, list[ForceMPC]]:
+    """Tune a problem's controller at each of several bandwidths, as `seaopt tune --sweep` does; of predictive control
+    the rows are of its linear region, and the plans are returned too. `free_law`, `executor`, `progress`: as in
+    `seaopt.control.sweep`.
+    """
+    design, robust_to = list_plants(problem, source)
+    if free_law and (problem.designs_on_response or problem.mpc is not None):
+        on = f"is designed on {problem.response_names[0]}" if problem.designs_on_response else 'has structure = "mpc"'
+        raise ProblemError(
+            f"{problem.source}: --free-law compares gains with any law of a model, and [controller] {on}; leave "
+            "--free-law out"
+        )
+    if problem.mpc is not None:
+        specs = [replace(problem.mpc, bandwidth_hz=bandwidth_hz) for bandwidth_hz in bandwidths_hz]
+        plans = [design_mpc(replace(problem, mpc=spec), source) for spec in count_off(specs, "bandwidth", progress)]
+        return sweep_plans(plans, robust_to), plans
+    assert problem.spec is not None
+    schedule = problem.schedule
+    result = sweep(
+        design,
+        problem.values(source),
+        settle_delays(problem.spec, problem.design_plant, source)[0],
+        bandwidths_hz,
+        robust_to,
+        over=None if schedule is None else schedule.over,
+        points=() if schedule is None else schedule.points,
+        outer=find_outer(problem, source),
+        draws=problem.draws(source),
+        free_law=free_law,
+        executor=executor,
+        progress=progress,
+    )
+    return result, []
 
 
 def _needs_reserve(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> bool:

@@ -4,7 +4,8 @@ from seaopt.robustness.bounds.bracket import Bracket, Budget, bracket
 from seaopt.robustness.bounds.stretch import StretchBound
 from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
-from seaopt.robustness.certificate.constrained import ConstrainedRuns, linear_controller
+from seaopt.robustness.certificate.constrained import ConstrainedRuns
+from seaopt.robustness.certificate.linear_region import linear_controller
 from seaopt.robustness.certificate.requirement import Requirement
 from seaopt.robustness.certificate.retuning.joint import JointTuning, Round, tune_certified
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations

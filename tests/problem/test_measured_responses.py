@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 import seaopt as so
 from seaopt.cli.main import app
+from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError, ProblemError
 from seaopt.problem.stages import certify_problem, list_plants, tune_problem
@@ -107,6 +108,85 @@ def test_models_beside_the_response_are_certified_too(write):
     assert [row.text.startswith("on measured points") for row in bands] == [True]
     assert certificate.monte_carlo.samples == 5 and set(certificate.plants) == {"stand"}
     assert certificate.met, [row for row in certificate.requirements if not row.met]
+
+
+WARM = """
+schema = 1
+title = "warm knee"
+[parameters]
+N = 100
+K_tau = 0.0369
+eta = 0.7
+J_m = 2.4e-5
+b_r = 4e-4
+f_c = 0.002
+v_s = 1.0
+k_s = 280
+J_l = 0.25
+d_l = 0.1
+m = 4.0
+L = 0.2
+[plant.stand]
+kind = "rotary"
+link = "locked"
+parts = ["thermal"]
+[plant.swing]
+kind = "rotary"
+link = "pendulum"
+[[experiment]]
+name = "chirp"
+plant = "stand"
+virtual = { seed = 1, duration_s = 40, rate_hz = 1000, noise_std = { tau_s = 0.01 }, excitation = { chirp = { amplitude = 2.0, f0_hz = 0.1, f1_hz = 150 }, noise = { std = 1.0, band_hz = 200 } } }
+[controller]
+plant = "frf:chirp"
+measured = "tau_s"
+bandwidth_hz = 16
+max_sensitivity = 1.7
+max_noise_gain = 60
+compute_delay_samples = 1
+current_limit_A = 9.0
+derate = true
+compensate = { friction = { fraction = 0.4 }, gravity = { plant = "swing", fraction = 0.8 } }
+gate = { range_N = [-300, 300] }
+[robustness]
+plants = ["swing"]
+samples = 5
+"""  # noqa: E501
+
+
+def test_what_no_response_tells_is_of_the_model_of_what_was_measured(tmp_path):
+    """Heat, friction and the largest step of the actuator that is on the stand, and the weight of the link: as of a law
+    that is designed on its model, and by the equations of the pendulum.
+    """
+    path = tmp_path / "knee.toml"
+    path.write_text(WARM)
+    problem = so.read_problem(path)
+    controller = tune_problem(problem, problem.parameters)
+    assert controller.design is None and controller.derate
+    path.write_text(WARM.replace('"frf:chirp"', '"stand"'))
+    modelled = so.read_problem(path)
+    other = tune_problem(modelled, modelled.parameters)
+    assert controller.heat_guard == other.heat_guard
+    assert controller.gate.max_step_N == pytest.approx(other.gate.max_step_N, rel=1e-9)
+    terms = controller.compensation
+    assert terms.friction.effort == pytest.approx(0.4 * 0.002 * 100, rel=1e-6)
+    angle = np.linspace(-1.5, 1.5, 7)
+    gravity = replace(terms, friction=None)
+    held = [gravity.step(FORGOTTEN, 0.0, [float(at)])[0] for at in angle]
+    np.testing.assert_allclose(held, 0.8 * 4.0 * 9.81 * 0.2 * np.sin(angle), atol=1e-4)
+    content = json.loads(so.files.to_json(controller.to_dict()))
+    again = so.Controller.from_dict(content, list_plants(problem, problem.parameters)[0], problem.parameters)
+    assert again.heat_guard == controller.heat_guard and again.compensation == controller.compensation
+    certificate = certify_problem(problem, controller, problem.parameters)
+    assert certificate.simulated.verification.rows
+
+
+def test_what_feeds_the_motor_back_is_refused_where_the_loop_is_measured(tmp_path):
+    path = tmp_path / "knee.toml"
+    path.write_text(WARM.replace("fraction = 0.4", 'fraction = 0.4, from = "speed"'))
+    problem = so.read_problem(path)
+    with pytest.raises(ControlError, match=r"compensate\.friction: it feeds the motor's motion back"):
+        tune_problem(problem, problem.parameters)
 
 
 def test_a_law_of_ones_own_is_measured_on_the_response(write, tmp_path):

@@ -42,7 +42,7 @@ def add_compensation(
     Parameters
     ----------
     controller : Controller
-        As tuned or read; it knows its design plant.
+        As tuned or read; it knows its design plant, or the model of what its measured response is of.
     friction : CompensateFriction, optional
         What is asked for friction; left out, none of it is compensated.
     gravity : CompensateGravity, optional
@@ -55,7 +55,8 @@ def add_compensation(
     Raises
     ------
     ControlError
-        The controller does not know its design plant; no friction is where the motor acts; the reference is that of an
+        The controller knows no such plant; it was designed on a measured response, and speed or ripple would be fed
+        back; no friction is where the motor acts; the reference is that of an
         outer loop, and friction would be compensated from it; nothing is shown to be stable for the measured speed; or
         the motor's position has no revolution.
 
@@ -68,22 +69,25 @@ def add_compensation(
     >>> round(add_compensation(controller, friction=CompensateFriction(fraction=0.8)).compensation.friction.effort, 6)
     40.0
     """
-    if controller.design is None:
+    model = controller.design or controller.measured_on
+    if model is None:
         raise ControlError(
-            "compensate: the controller does not know its design plant, whose friction it would compensate; tune it on "
-            "a model, or read it with Controller.from_dict"
+            "compensate: the controller does not know its design plant, whose friction it would compensate; read it "
+            "with Controller.from_dict"
         )
     if friction is None and gravity is None and ripple is None:
         return replace(controller, compensation=None)
+    fed_back = "ripple" * (ripple is not None) or "friction" * (friction is not None and friction.source == "speed")
+    if fed_back and controller.designs_on_response:
+        raise ControlError(
+            f"compensate.{fed_back}: it feeds the motor's motion back, and of the loop with it a measured response of "
+            f"{controller.spec.regulated} says nothing; design on a model, and name the response in robust_to"
+        )
     added = Compensation(
         sample_time_s=controller.sample_time_s,
-        friction=None if friction is None else _meet_friction(controller, *controller.design, friction),
-        gravity=None
-        if gravity is None
-        else make_gravity_term(*(link or controller.design), controller.spec.regulated, gravity),
-        ripple=None
-        if ripple is None
-        else make_ripple_term(controller.design[0], controller.command.per_effort, ripple),
+        friction=None if friction is None else _meet_friction(controller, *model, friction),
+        gravity=None if gravity is None else make_gravity_term(*(link or model), controller.spec.regulated, gravity),
+        ripple=None if ripple is None else make_ripple_term(model[0], controller.command.per_effort, ripple),
     )
     return replace(controller, compensation=added)
 

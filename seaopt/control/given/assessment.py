@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from seaopt.control.frontier.rows import FrontierRow, make_row
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delays, take_own_delays
 from seaopt.control.laws.spec import ControllerSpec
@@ -69,6 +70,20 @@ def assess(
     >>> controller.structure, controller.achieved.stable
     ('custom', True)
     """
+    return assess_row(law, plant, params, spec, robust_to, draws=draws, outer=outer)[1]
+
+
+def assess_row(
+    law: Any,
+    plant: Plant | MeasuredResponse,
+    params: Fit | ParameterSet,
+    spec: ControllerSpec,
+    robust_to: RobustTo | None = None,
+    *,
+    draws: Draws = (),
+    outer: Surround | None = None,
+) -> tuple[FrontierRow, Controller]:
+    """Return the controller of `assess` with its row of a frontier."""
     if isinstance(law, Plant):
         raise ControlError("law = a Plant; the law comes first, as in certify: assess(law, plant, params, spec)")
     require_type(spec, ControllerSpec, "spec", "give a ControllerSpec", ControlError)
@@ -93,10 +108,11 @@ def assess(
     spec = replace(spec, structure=CUSTOM, notch=None, prefilter=None, link_feedforward=None, reference_weights="tuned")
     task = make_task(plant, design.complete(values), spec, robust_to, draws)
 
-    def describe(task: Task) -> Controller:
+    def describe(task: Task) -> tuple[FrontierRow, Controller]:
         loops = task.measure_law(law, filter_samples=count_filter_samples(law), integral_rad_s=find_integral_rate(law))
-        return describe_law(task, law, loops, (plant, values), gains={})
+        controller = describe_law(task, law, loops, (plant, values), gains={})
+        return make_row(task, law, loops, controller), controller
 
-    controller = describe(task)
+    row, controller = describe(task)
     around = None if outer is None else outer(controller)
-    return controller if around is None else describe(task.enclosed(around, controller.command.per_effort))
+    return (row, controller) if around is None else describe(task.enclosed(around, controller.command.per_effort))

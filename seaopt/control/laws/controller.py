@@ -148,6 +148,9 @@ class Controller(ClosesLoops, Result, Worded):
         then (`seaopt.control.scheduling.step_order`).
     designed_on_response : bool
         The design plant is a measured response, and `design` is the plant that was measured.
+    measured_on : (Plant, ParameterSet) or None
+        Of one without `design`: the model of the plant that was measured, for what no response tells, as its motor's
+        heat.
     """
 
     plot = PlotAccessor()
@@ -178,6 +181,7 @@ class Controller(ClosesLoops, Result, Worded):
     derate: bool = False
     share: float | None = None
     designed_on_response: bool = False
+    measured_on: tuple[Plant, ParameterSet] | None = None
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -390,9 +394,8 @@ class Controller(ClosesLoops, Result, Worded):
     @property
     def rating(self) -> MotorRating | None:
         """The thermal rating of the design plant's motor; None without the part "thermal"."""
-        if self.design is None or self.design[0].winding is None:
-            return None
-        return rate_motor(*self.design, self.command_limit)
+        model = self.design or self.measured_on
+        return None if model is None or model[0].winding is None else rate_motor(*model, self.command_limit)
 
     @property
     def heat_guard(self) -> HeatGuard | None:
@@ -506,7 +509,8 @@ class Controller(ClosesLoops, Result, Worded):
         if isinstance(plant, MeasuredResponse):
             loop = DiscLoop(plant=spec.see_response(plant, command), law=controller.law)
             command = replace(command, largest=find_range(plant.plant, params))
-            controller = replace(controller, command=command, achieved=loop.figures(spec.bandwidth_hz))
+            achieved, model = loop.figures(spec.bandwidth_hz), (plant.plant, params)
+            controller = replace(controller, command=command, achieved=achieved, measured_on=model)
         else:
             if controller.link is not None:
                 check_link(controller.link, spec, plant)

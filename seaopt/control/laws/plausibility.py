@@ -402,9 +402,10 @@ class PlausibilityGate:
             raise ControlError("the controller has no current limit (or command_limit); give its specification one")
         largest = spec.max_step_N
         if largest is None:
-            if controller.design is None:
+            model = controller.design or getattr(controller, "measured_on", None)
+            if model is None:
                 raise ControlError("the controller has no design plant to compute the largest step of; give max_step_N")
-            plant = controller.close(*controller.design).plant
+            plant = controller.close(*model).plant
             largest = spec.margin * largest_step(plant, limit / controller.per_effort)
         agreement = None
         if spec.agreement:

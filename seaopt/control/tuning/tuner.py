@@ -501,6 +501,7 @@ def describe_law(
         active_constraints=tuple(broken or list_active(spec, verdicts)),
         robust_to=task.names[task.design_states :],
         design=None if isinstance(plant, MeasuredResponse) else (plant, params),
+        measured_on=(plant.plant, params) if isinstance(plant, MeasuredResponse) else None,
         observer=observer,
         blocked_by=tuple(_explain_rest(task, text) for text in explanations),
         possible=None if not broken else possible,

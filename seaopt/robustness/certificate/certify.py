@@ -42,10 +42,11 @@ from seaopt.robustness.certificate.cases import (
 )
 from seaopt.robustness.certificate.certificate import NO_MODEL, Certificate
 from seaopt.robustness.certificate.compensation import COMPENSATION
-from seaopt.robustness.certificate.constrained import CONSTRAINED, linear_controller
+from seaopt.robustness.certificate.constrained import CONSTRAINED
 from seaopt.robustness.certificate.friction import FRICTION
 from seaopt.robustness.certificate.impedance import IMPEDANCE
 from seaopt.robustness.certificate.limits import LOGS, MEASURED, NOMINAL
+from seaopt.robustness.certificate.linear_region import linear_controller
 from seaopt.robustness.certificate.measured_draws import DRAWS
 from seaopt.robustness.certificate.scheduled import JOINT_DRAWS, STRETCHES, SWEEPS
 from seaopt.robustness.certificate.simulated import SIMULATIONS, STEPS

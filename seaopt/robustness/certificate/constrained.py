@@ -1,7 +1,6 @@
-"""Predictive control: as a law while no limit is active, and simulated with its limits active over draws.
+"""Predictive control simulated with its limits active over draws.
 
-While no limit is active the plan's first command is linear in state and reference, so that its loop has margins, worst
-cases and draws as every other's (`linear_controller`). Where the program's constraints are active there is no such law.
+While no limit is active it is a law (`linear_region`). Where the program's constraints are active there is no such law.
 Then parameters, steps and disturbances are drawn. Each run is the law as it runs, solver and fallback included, on the
 nonlinear plants:
 
@@ -27,22 +26,14 @@ import numpy as np
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
 from seaopt.control import (
-    Controller,
-    ControllerSpec,
     ForceMPC,
     ForceRun,
-    Law,
-    MPCSpec,
     MPCStep,
-    assess,
     close_loop,
 )
-from seaopt.control.laws.delay import DELAY_KEYS
-from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.outer_loop import FIRST, follow_link
 from seaopt.control.loops.sampled_plant import DELAYS, conditions
 from seaopt.control.mpc.active_set import UNFINISHED
-from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
 from seaopt.errors import SeaoptError
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count
@@ -75,45 +66,6 @@ RUNAWAY, GROWTH = 3.0, 1.5  # times what the limits hold; second half of the las
 CONSTRAINED_FAILURES, CONSTRAINED_PROBABILITY = "constrained_failures", "constrained_failure_probability"
 RUN_SECONDS = 0.35  # that a run on a plant takes as a rule
 DIVERGED, OVER_BOUND, UNSETTLED, RINGS = "diverged", "over a bound", "not settled", "ringing"
-
-
-def linear_controller(mpc: ForceMPC) -> Controller:
-    """Return a predictive controller's law while no limit is active, as a controller with the same limits of its loop.
-
-    It has no limit of the command: what the plan does with one is no part of it.
-
-    Examples
-    --------
-    >>> import seaopt as so
-    >>> from seaopt.control import MPCSpec, force_mpc
-    >>> spec = MPCSpec(current_limit_A=9.0, bandwidth_hz=20)
-    >>> controller = linear_controller(force_mpc(so.plants.high_impedance(), so.plants.thor(), spec))
-    >>> controller.structure, controller.feasible
-    ('custom', True)
-    """
-    law = mpc.law  # its integrator apart: rounding leaves that pole on either side of the unit circle
-    split = Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
-    return replace(assess(split, *mpc.design, linear_spec(mpc.spec)), outer=mpc.outer)
-
-
-def linear_spec(spec: MPCSpec) -> ControllerSpec:
-    """Return the limits of a predictive controller's loop while no limit of its plan is active, as those of a law."""
-    levels: dict[str, Any] = {
-        limit.name: getattr(spec, limit.name)
-        for limit in MPC_LIMITS
-        if limit.has_field and limit.name != "bandwidth_hz"
-    }
-    return ControllerSpec(
-        structure=CUSTOM,
-        measured=spec.measured,
-        bandwidth_hz=spec.bandwidth_hz,
-        bandwidth_range_hz=(min(15.0, spec.bandwidth_hz), max(60.0, spec.bandwidth_hz)),
-        sample_rate_hz=spec.sample_rate_hz,
-        min_filter_samples=False,
-        bandwidth_tolerance=MPC_BANDWIDTH_TOLERANCE,
-        **levels,
-        **{name: getattr(spec, name) for name in DELAY_KEYS},
-    )
 
 
 @record
