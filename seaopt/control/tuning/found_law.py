@@ -9,11 +9,12 @@ from typing import Protocol, Self, TypeVar, runtime_checkable
 from seaopt.control.laws.command import Command
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import MeasuredLoop
+from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.verdict import PossibleBandwidths
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.tuning.frequencies import count_growing
 from seaopt.control.tuning.grid import FRICTION
-from seaopt.control.tuning.law_numbers import LawNumbers
+from seaopt.control.tuning.law_numbers import LawNumbers, read_numbers
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.possible_bandwidths import find_largest_fall, find_possible_bandwidths
 from seaopt.control.tuning.solution import (
@@ -24,8 +25,9 @@ from seaopt.control.tuning.solution import (
     retry,
     search,
     solve,
+    solve_near,
 )
-from seaopt.errors import SeaoptError
+from seaopt.errors import ControlError, SeaoptError
 from seaopt.plants.friction import list_fall_parameters
 from seaopt.progress import Progress, divide
 from seaopt.records import record
@@ -156,6 +158,28 @@ def find_law(task: Task, warm: Sequence[LawNumbers], progress: Progress) -> Foun
         if task.list_broken(loops):
             x, loops = ease_limits(task, x, loops, easing)
     return FoundLaw(task=task, x=x, loops=loops, possible=possible)
+
+
+def find_near(task: Task, near: Controller) -> FoundLaw | None:
+    """Return the best law in the valley of a neighbour, of the same parts; None where it is not stable here, or the
+    law misses a limit: another valley may have one that does not. So it is where a friction margin is asked for. Raises
+    ControlError: the neighbour has other parts.
+    """
+    if _list_parts(near.spec) != _list_parts(task.spec):
+        raise ControlError(
+            f"near is a law of other parts than the one asked for ({near.structure}, {task.spec.structure}); give one "
+            "of the same structure, measured outputs, notch and prefilter, or leave it out"
+        )
+    x = task.tidy(read_numbers(near.gains, task.k_ff, near.sample_time_s))
+    if task.asks_margin or not task.is_stable(x):
+        return None
+    x, loops = solve_near(task, x)
+    return None if task.list_broken(loops) else FoundLaw(task=task, x=x, loops=loops)
+
+
+def _list_parts(spec: ControllerSpec) -> tuple[object, ...]:
+    """Return what a law is made of: laws of the same have the same gains."""
+    return spec.structure, spec.measured, spec.notch is None, spec.reference_filter is None
 
 
 def _find_possible(

@@ -86,7 +86,7 @@ def _meet_friction_margin(task: Task, x: LawNumbers, loops: list[MeasuredLoop], 
         return best
     *parts, raising = divide(progress, ONCE, ONCE, ONCE, RAISING)
     if broken - {FRICTION}:  # what cannot be kept without a margin cannot be kept with it
-        return _solve_from(task.aim_multipliers(x), x, parts[0])
+        return solve_near(task.aim_multipliers(x), x, parts[0])
     other = x
     for multiplier, part in zip(("", "", SIMPLEST), parts, strict=True):
         tried = _solve_once(task.aim_multipliers(best[0], multiplier), (best[0],), part)
@@ -144,7 +144,7 @@ def _solve_once(task: Task, warm: Sequence[LawNumbers], progress: Progress, far_
     return _finish(task, grid, x, checking)
 
 
-def _solve_from(task: Task, x: LawNumbers, progress: Progress = ignore, *, keeping: bool = False) -> Solution:
+def solve_near(task: Task, x: LawNumbers, progress: Progress = ignore, *, keeping: bool = False) -> Solution:
     """Find the best numbers near others; `keeping` is of `refine`."""
     grid = make_grid(task)
     return _finish(task, grid, _descend(task, grid, x, keeping=keeping), progress)
@@ -188,7 +188,7 @@ def retry(
     for start in map(task.tidy, starts):
         if not task.is_stable(start):
             continue
-        tried = _solve_from(task, start, keeping=keeping)
+        tried = solve_near(task, start, keeping=keeping)
         broken = task.list_broken(tried[1])
         if not broken - {FRICTION}:
             return _meet_friction_margin(task, *tried, ignore) if broken else tried
@@ -354,7 +354,7 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
     if miss > CLEARLY:
         near = none.tidy(x)
         scanned = miss <= FAR_OFF or not none.is_stable(near)
-        without = solve(none, (x,), far_off=CLEARLY) if scanned else _solve_from(none, near)
+        without = solve(none, (x,), far_off=CLEARLY) if scanned else solve_near(none, near)
         if none.list_broken(without[1]) == {FRICTION} and not scanned:
             without = _meet_friction_margin(none, *without, ignore)
         least, start = min((miss, x), (_measure_miss(none, without[0]), without[0]), key=lambda pair: pair[0])

@@ -52,7 +52,7 @@ from seaopt.control.loops.sampled_plant import (
 )
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.tuning.feasibility import check_current, check_delay
-from seaopt.control.tuning.found_law import FoundLaw, Surround, find_law, meet_outer
+from seaopt.control.tuning.found_law import FoundLaw, Surround, find_law, find_near, meet_outer
 from seaopt.control.tuning.frequencies import count_growing
 from seaopt.control.tuning.grid import FRICTION, PlantWithFriction, Response
 from seaopt.control.tuning.law_numbers import LawNumbers
@@ -95,6 +95,7 @@ def tune(
     *,
     draws: Draws = (),
     outer: Surround | None = None,
+    near: Controller | None = None,
     progress: Progress = ignore,
 ) -> Controller:
     """Tune a digital force controller.
@@ -119,6 +120,10 @@ def tune(
         Returns the outer loop that a tuned controller is to run with, or None: the `outer` of what
         `seaopt.control.add_impedance` returns. Ms, Mt, disk margin and stability are then those of both loops on every
         plant whose link moves; what is asked of the design plant alone is asked of the force law.
+    near : Controller, optional
+        A law of the same parts that was tuned with a limit or the bandwidth a little off: only what is near it is
+        looked at, in a third of the time, and everything where that keeps not all limits, or a friction margin is
+        asked for. A far better law of other gains is not seen.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
 
@@ -157,7 +162,7 @@ def tune(
             raise
 
     try:
-        return _tune(plant, params, spec, robust_to or {}, draws, outer, hook)
+        return _tune(plant, params, spec, robust_to or {}, draws, outer, near, hook)
     except (SeaoptError, MemoryError):
         raise
     except Exception as error:
@@ -186,6 +191,7 @@ def _tune(
     robust_to: RobustTo,
     draws: Draws,
     outer: Surround | None,
+    near: Controller | None,
     progress: Progress,
 ) -> Controller:
     model = name_design(plant)
@@ -210,7 +216,8 @@ def _tune(
     if at_rest is not None and allowed is not None:  # no law keeps it, at any bandwidth: the others are looked after
         task = replace(task, eased={"max_noise_gain": ROOM * at_rest / allowed})
     alone, around = divide(progress, 1.0, AROUND * (outer is not None))
-    found = find_law(task, (), alone)
+    found = None if near is None else find_near(task, near)
+    found = find_law(task, (), alone) if found is None else found
     if outer is not None:
         found = meet_outer(found, partial(_describe, design=(plant, params)), outer, around)
     controller = _describe(found, (plant, params))
