@@ -8,10 +8,10 @@ from pathlib import Path
 
 from seaopt.control import Controller
 from seaopt.formatting import format_count, format_number, join_words
-from seaopt.machine.acceptance import Acceptance
+from seaopt.machine.acceptance import EXPLAINED, Acceptance
 from seaopt.machine.causes import Cause, read_gains
 from seaopt.machine.differences.certified import Differences
-from seaopt.machine.differences.explanations import Difference
+from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.figures import list_panels
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
@@ -95,6 +95,15 @@ STABILITY = (
     "Stability is the least |1 + L| over the radius of its disc (no unit): above 1 no disc holds zero, where the loop "
     "would be at its limit of stability."
 )
+PARTLY = "which explains {} of the difference: more than that differs, and its size may be another one beside it"
+ONE_ALONE = "Each row is by itself, in place of the others: shares do not add up."
+NOT_TOLD = "Rows whose shares are alike are not told apart by the log."
+TWO_AMPLITUDES = (
+    "A limit of the drive and a smaller gain are told apart by a log at half the amplitude: a gain stays as it is."
+)
+IN_PART = (
+    "No row explains all of it. An interval holds where nothing but its row differs; the true size may be outside."
+)
 UNTOLD = {
     "short, gain": "a law whose {} is half as large",
     "short, factor": "a {} that is halved",
@@ -162,7 +171,11 @@ def say_cause(cause: Cause) -> str:
 
 
 def say_difference(each: Difference) -> str:
-    """Return a difference in words."""
+    """Return a difference in words; of two that explain it together both."""
+    return ", and ".join(map(_say_part, (each, *each.beside)))
+
+
+def _say_part(each: Difference) -> str:
     others = [f"{name} {format_number(value, 3)}" for name, value in zip(each.alike, each.alike_values, strict=True)]
     also = f" (or {', or '.join(others)})" if others else ""
     match each.kind:
@@ -176,6 +189,9 @@ def say_difference(each: Difference) -> str:
         case "mode":
             pole = "" if each.size is None else f", its pole at {format_number(each.value / each.size, 3)} Hz"
             return f"there is a mode at {format_number(each.value, 3)} Hz{pole}"
+        case "drive limit":
+            level = f"{format_number(each.value, 3)}{unit_after(each.unit)}"
+            return f"the drive gives at most {level} of what is commanded"
         case "rate":
             return (
                 f"the law is stepped at {format_number(each.value)} Hz by what the machine does, "
@@ -206,11 +222,21 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
             reasons.append(Reason(what=f"the log does not decide {_say_undecided(response)}"))
     if differences is not None and not differences.inside:
         parts.append("the machine is not one of those certified")
-        best = "its response is another one" if not differences.found else say_difference(differences.found[0])
-        reasons.append(Reason(what=best))
+        reasons.append(Reason(what=_say_best(differences)))
     if response is None and result.replayed:
         reasons += [Reason(what=f"no response: {text}") for text in result.left_out.values()]
     return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons))
+
+
+def _say_best(differences: Differences) -> str:
+    """Return what explains best that the machine is another one, those that the log does not tell apart, and whether
+    more than that is there.
+    """
+    if not differences.found:
+        return "its response is another one"
+    best, *others = differences.found
+    said = "; or ".join(map(say_difference, (best, *(each for each in others if each.untold))))
+    return said if best.explains >= EXPLAINED else f"{said}, {PARTLY.format(f'{100.0 * best.explains:.0f} %')}"
 
 
 def _name(row: Judged) -> str:
@@ -243,7 +269,10 @@ def _say_undecided(response: Response) -> str:
     rows = [row for row in rows if row.near is None]
     record: list[str] = []
     if response.needs_phases:
-        record.append(f"{LEAST_PHASES} sets of random phases, which dry friction asks for")
+        below = (
+            " and with the command below its limit" if any(part.left_out.limit for part in response.measured) else ""
+        )
+        record.append(f"{LEAST_PHASES} sets of random phases{below}, which dry friction asks for")
     if response.needs_lines is not None:
         low, high = (format_number(edge, 3) for edge in response.needs_lines)
         record.append(
@@ -353,8 +382,13 @@ def _say_extent(part: Measured) -> str:
     return f"{counts[0]}, {counts[1]} of phases, {part.f.size} lines from {low} to {high} Hz"
 
 
+def _show_ranges(each: Difference) -> str:
+    """Return the interval of a difference, of two that explain it together both."""
+    return "; ".join(filter(None, map(_show_range, (each, *each.beside))))
+
+
 def _show_range(each: Difference) -> str:
-    """Return the interval of a difference, of a delay in ms as it is said."""
+    """Return an interval, of a delay in ms as it is said."""
     if each.low is None or each.high is None:
         return ""
     scale, unit = (1e3, " ms") if each.kind == "delay" else (1.0, "")
@@ -365,7 +399,7 @@ def _describe_differences(differences: Differences) -> Section:
     rows = tuple(
         (
             say_difference(each),
-            _show_range(each),
+            _show_ranges(each),
             f"{100.0 * each.explains:.3g} %",
         )
         for each in differences.found
@@ -384,7 +418,24 @@ def _describe_differences(differences: Differences) -> Section:
         nearest = ", ".join(f"{name} {format_number(value)}" for name, value in differences.nearest.items())
         sentences.append(f"The nearest of the certificate's draws: {nearest}.")
     tables = (Table(head=("difference", "95 % interval", "explains"), rows=rows, align="<>>"),) if rows else ()
-    return Section(title="Measured and certified", part="differences", sentences=tuple(sentences), tables=tables)
+    return Section(
+        title="Measured and certified", part="differences", sentences=tuple(sentences), tables=tables,
+        remarks=_remark(differences),
+    )  # fmt: skip
+
+
+def _remark(differences: Differences) -> tuple[str, ...]:
+    """Return how rows of the table of differences are to be read."""
+    if not differences.found:
+        return ()
+    remarks = [ONE_ALONE] if len(differences.found) > 1 else []
+    if any(each.untold for each in differences.found):
+        remarks.append(NOT_TOLD)
+        if any(each.kind == "drive limit" for each in differences.found):
+            remarks.append(TWO_AMPLITUDES)
+    if differences.found[0].explains < EXPLAINED:
+        remarks.append(IN_PART)
+    return tuple(remarks)
 
 
 def _describe_replay(result: Acceptance) -> list[Section]:

@@ -22,7 +22,7 @@
 typedef struct {
     double mass, damping, stiffness, per_ampere, coulomb, smoothing; /* M, b, k, kF, f_c, v_s */
     double mass2, stiffness2, damping2;                              /* zero mass2: no such part */
-    double delay_s, late, law_gain, reading_sign, drive_sign, sensor_range, current_step, force_step, every;
+    double delay_s, late, law_gain, reading_sign, drive_sign, sensor_range, current_step, force_step, every, drive_limit;
 } machine;
 
 static void rate(const machine *m, const double *x, double i, double *d)
@@ -71,7 +71,10 @@ void run(const machine *m, long n, long steps, double period, const double *refe
         for (j = 0; j < steps; j++) {
             double t = (double)k + ((double)j + 0.5) / (double)steps - m->late - m->delay_s / period;
             long at = (long)floor(t);
-            advance(m, x, m->drive_sign * (at >= 0 ? current[at] : 0.0), period / (double)steps);
+            double given = at >= 0 ? current[at] : 0.0;
+            if (given > m->drive_limit) given = m->drive_limit;
+            if (given < -m->drive_limit) given = -m->drive_limit;
+            advance(m, x, m->drive_sign * given, period / (double)steps);
         }
     }
 }

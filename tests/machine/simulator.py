@@ -39,6 +39,7 @@ class Machine:
     current_step: float = 0.0
     force_step: float = 0.0
     every: float = 1.0
+    drive_limit: float = 1e9  # behind the logged command
 
     @classmethod
     def of_knee(cls, values) -> Machine:

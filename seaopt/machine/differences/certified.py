@@ -16,9 +16,10 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.machine.differences.comparison import TOLERATED, Comparison
-from seaopt.machine.differences.explanations import Difference, explain
+from seaopt.machine.differences.explanations import explain
 from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
+from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.response.periods import shorten
 from seaopt.machine.response.verdicts import Measured, has_dry_friction
 from seaopt.machine.ticks import Ticks, find_edges
@@ -75,7 +76,7 @@ def compare(
     flat = [*_list_clipped(controller, [ticks.take(np.flatnonzero(ticks.complete)) for ticks in logs])]
     at = {name: each.value for name, each in nominal.items()}
     spread = take_spread(draws, at)
-    found = [*flat, *explain(comparison, beside, model, spread)]
+    found = [*flat, *explain(comparison, beside, logs, model, spread)]
     misfits = [comparison.misfit(row) for row in drawn]
     best = int(np.argmin(misfits)) if misfits else None
     each_line = bool(np.all(share <= TOLERATED))

@@ -6,6 +6,7 @@ reference and cut as the log is, since it depends on amplitude; two periods of e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control import Controller, sample
+from seaopt.errors import LogError
 from seaopt.machine.design_run import RTOL, run_design
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.judged import Measured
@@ -37,12 +39,18 @@ class Comparison:
     logs: Sequence[Ticks]
     names: tuple[str, ...]  # of the outputs
     rate: float = 1.0  # at which the model's law is stepped, over what the clock of the logs says
+    simulated: bool = False  # whether the model is, without dry friction too
 
     @property
     def plant(self) -> Plant:
         """The controller's design plant."""
         assert self.controller.design is not None
         return self.controller.design[0]
+
+    @property
+    def simulates(self) -> bool:
+        """Whether the model's response depends on what was played, and is simulated therefore."""
+        return self.simulated or has_dry_friction(self.controller)
 
     @property
     def ratios(self) -> list[Ratio]:
@@ -60,6 +68,14 @@ class Comparison:
         return np.concatenate([np.maximum(ratio.std, RTOL * np.abs(ratio.value)) for ratio in self.ratios])
 
     @property
+    def widening(self) -> float:
+        """By how much sizes that are fitted with weights of :math:`1/s^2` spread more than these tell: of normal errors
+        the mean of :math:`s^{-4}` over the square of that of :math:`s^{-2}`, with nu = 2P - 2 degrees of freedom.
+        """
+        free = 2 * min(ratio.blocks for ratio in self.ratios) - 2
+        return math.sqrt(max(free - 2, 1) / max(free - 4, 1))
+
+    @property
     def f(self) -> Float[np.ndarray, " m"]:
         """Hz, of each of its lines."""
         return np.concatenate([part.f for part in self.measured for _ in self.names])
@@ -75,8 +91,8 @@ class Comparison:
 
     def predict(self, sets: Sequence[ParameterSet]) -> list[Lines]:
         """Return the responses of the model with each of some values."""
-        if has_dry_friction(self.controller) and sets:
-            return self._simulate(sets)
+        if self.simulates and sets:
+            return [self._read(groups) for groups in self.simulate(sets)]
         return [self.linearise(values) for values in sets]
 
     def linearise(self, values: ParameterSet) -> Lines:
@@ -86,25 +102,38 @@ class Comparison:
         sampled = sample(seen, law.delay(values), self.names, law.per_effort, *timing)
         return np.concatenate([sampled.responses(self.rate * part.f).ravel() for part in self.measured])
 
-    def _simulate(self, sets: Sequence[ParameterSet]) -> list[Lines]:
-        """Return the responses of the law on the nonlinear plant, under the logged references."""
+    def simulate(self, sets: Sequence[ParameterSet]) -> list[list[Blocks]]:
+        """Return the periods of the law on the nonlinear plant with each of some values, under the logged references
+        and cut as the logs are, by amplitude.
+        """
         runs = [run_design(self.controller, sets, ticks.reference, rate=self.rate) for ticks in self.logs]
         return [self._cut([run.outputs for run in runs], k) for k in range(len(sets))]
 
-    def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> Lines:
-        """Return the response of the k-th of some runs, cut as the logs are."""
-        law, signals = self.controller.law, self.controller.signals
-        blocks, parts = list[Blocks](), list[Lines]()
+    def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> list[Blocks]:
+        """Return the periods of the k-th of some runs, but those in which the logged command is at its limit."""
+        signals, blocks = self.controller.signals, list[Blocks]()
         for ticks, run in zip(self.logs, outputs, strict=True):
             readings = np.column_stack([run[name][k] for name in signals])
             beside = {name: run[name][k] for name in self.names if name not in signals}
-            simulated = replace(ticks, measured=readings, beside=beside, command=0.0 * ticks.command)
-            blocks.append(cut_periods(self.controller, simulated))
-        for group in join_blocks(blocks):
-            mean = group.average()
-            shown = dict(zip(signals, mean.measured.swapaxes(0, 1), strict=True)) | dict(mean.beside)
-            read = {name: np.mean(each / mean.reference, axis=0) for name, each in shown.items()}
-            forward, *feedback = law.responses(group.f)
-            effort = forward + np.sum(np.array(feedback) * [read[name] for name in signals], axis=0)
-            parts += [read[name] / effort for name in self.names]
+            simulated = replace(ticks, measured=readings, beside=beside)
+            try:
+                blocks.append(cut_periods(self.controller, simulated))
+            except LogError:  # of each set of phases, the periods that were not at the limit are others
+                blocks.append(cut_periods(self.controller, replace(simulated, command=0.0 * ticks.command)))
+        return [self._command(group) for group in join_blocks(blocks)]
+
+    def _command(self, blocks: Blocks) -> Blocks:
+        """Return periods with the effort that the law makes of what it reads in them."""
+        forward, *feedback = self.controller.law.responses(blocks.f)
+        effort = forward * blocks.reference + np.sum(np.array(feedback) * blocks.measured, axis=1)
+        return replace(blocks, effort=effort)
+
+    def _read(self, groups: Sequence[Blocks]) -> Lines:
+        """Return the responses of periods to the effort, signal by signal, amplitude by amplitude."""
+        parts = list[Lines]()
+        for group in groups:
+            rows = group.average()
+            shown = dict(zip(self.controller.signals, rows.measured.swapaxes(0, 1), strict=True)) | dict(rows.beside)
+            effort = np.mean(rows.effort / rows.reference, axis=0)
+            parts += [np.mean(shown[name] / rows.reference, axis=0) / effort for name in self.names]
         return np.concatenate(parts)

@@ -14,120 +14,207 @@ spring.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from seaopt.control.loops.sampled_plant import DELAYS
-from seaopt.machine.differences.comparison import TOLERATED, Comparison, Lines
-from seaopt.machine.differences.leeway import Leeway, Spread, take_spread
-from seaopt.parameters import Parameter, ParameterSet
+from seaopt.machine.differences.comparison import Comparison, Lines
+from seaopt.machine.differences.drive_limit import find_distortion, make_knob, take_limited, try_limit
+from seaopt.machine.differences.leeway import Spread, take_spread
+from seaopt.machine.differences.pairs import Start, find_pairs
+from seaopt.machine.differences.size_fit import Best, Difference, SizeFit, Tried
+from seaopt.machine.differences.size_search import (
+    FOUND,
+    MOST_SPREAD,
+    MOST_STEP,
+    ROUNDS,
+    STEP,
+    SURE,
+    Knob,
+    Search,
+    Slopes,
+    find_slopes,
+    make_delay,
+    refine,
+    step,
+)
+from seaopt.machine.ticks import Ticks
+from seaopt.parameters import ParameterSet
 from seaopt.records import record
-from seaopt.robustness.uncertainty.worst import place_values
 
-STEP = 0.02  # of a parameter, to see what it does
-ROUNDS = 4  # of Gauss and Newton
-FOUND = 1e-3  # of a factor's logarithm: it is found where it moves by less
-MOST_STEP = 0.5  # of it, in a round
-MOST_LOG = 1.5  # of a factor: its logarithm goes no further
-MOST_SPREAD = 10.0  # of a factor's logarithm, above which the log does not tell the factor
 RIVAL = 20.0  # times what the best parameter leaves: parameters whose leeway is looked at where they are
 WORTH = 2.0  # times what noise leaves: a misfit above has causes
-# Of the misfit, in what noise leaves of a line: twice the difference of two causes is a chi square, 99.9 %.
-UNTOLD = 5.4
-ALIKE = 2.0  # times what the best of some causes leaves of other outputs: causes that go with these as well
+ALIKE = (
+    2.0  # times what the best of some causes leaves of other outputs, or between the lines: these go with it as well
+)
+HALF = 0.5  # of what the best cause explains, and of what a gain does, from which on others are looked at
 MODE_DAMPINGS = (0.02, 0.1)
 SEEN = 5.0  # std by which a line differs where a mode is looked for
-MODE_COST = 2.0  # by which a mode, of several sizes, has to leave less than another cause does
 LEAST_DAMPING, MOST_DAMPED = math.log(1e-4), 0.3
 # Over that of the clock, at which timers step a law by mistake; the first two are tried always.
 USUAL_RATES = (0.5, 2.0, 0.1, 0.2, 0.25, 1.0 / 3.0, 3.0, 4.0, 5.0, 10.0)
 SAME_RATE = 0.01  # relative: a rate that is a usual one
-RATE_COST = 2.0  # by which such a rate may leave more than another cause does
 MOST = 4  # causes that are listed
-
-Slopes = Complex[np.ndarray, "n m"]
-
-
-@record
-class Difference:
-    """A way in which the machine differs, its size, and how much of the difference it explains."""
-
-    kind: str  # parameter, gain, delay, mode, range, rate
-    name: str  # the parameter, the signal
-    value: float  # factor of a parameter or gain; seconds; Hz of a mode, of the law's ticks; the range
-    low: float | None
-    high: float | None
-    unit: str
-    explains: float  # share of the misfit, of what no certified machine has
-    alike: tuple[str, ...] = ()  # parameters that would explain as much
-    alike_values: tuple[float, ...] = ()  # their factors
-    size: float | None = None  # of a mode: its zero's frequency over its pole's; of a rate: over that of the log
 
 
 @record(eq=False)
-class _Tried:
-    """A cause with the size that fits best, and the misfit that it leaves."""
+class Case:
+    """What is to be explained: the measured response beside a model's, and the spread of what was certified."""
 
-    difference: Difference
-    left: float
-    response: Lines
-    values: ParameterSet | None = None  # of the plant, where a parameter is the cause
-
-    def is_like(self, other: _Tried, noise: float) -> bool:
-        """Tell whether two causes may be one, both factors of parameters or gains: the log does not tell them apart, or
-        their responses differ by less than a machine and its model do. `noise`: what it leaves of the misfit.
-        """
-        mine, its = self.difference, other.difference
-        if not (mine.unit == its.unit == "-" and {mine.kind, its.kind} <= {"parameter", "gain"}):
-            return False
-        untold = abs(self.left - other.left) <= UNTOLD * max(other.left / noise, 1.0)
-        return untold or bool(np.max(np.abs(self.response / other.response - 1.0)) <= TOLERATED)
+    comparison: Comparison
+    beside: Comparison  # of what was logged and the law does not read
+    logs: Sequence[Ticks]  # all of them, which the comparison may have in part
+    values: ParameterSet
+    spread: Spread
+    model: Lines
+    slopes: Slopes  # of what was certified, at the model
+    before: float  # the misfit without any cause
 
     @property
-    def rank(self) -> float:
-        """What it leaves, times what its kind costs."""
-        if self.difference.kind == "rate":
-            return self.left / RATE_COST
-        return self.left * (MODE_COST if self.difference.kind == "mode" else 1.0)
+    def noise(self) -> float:
+        """What noise leaves of the misfit."""
+        return float(self.comparison.f.size)
+
+    @property
+    def fit(self) -> SizeFit:
+        """The fit of sizes beside what certified machines differ by."""
+        return SizeFit(comparison=self.comparison, leeway=self.spread.leave(self.slopes))
+
+    def share(self, tried: Tried) -> float:
+        """Return how much of the misfit a cause explains."""
+        return 1.0 - max(tried.left - self.noise, 0.0) / (self.before - self.noise)
 
 
-def explain(comparison: Comparison, beside: Comparison, model: Lines, spread: Spread) -> list[Difference]:
+def explain(
+    comparison: Comparison, beside: Comparison, logs: Sequence[Ticks], model: Lines, spread: Spread
+) -> list[Difference]:
     """Return the causes that explain the misfit of a controller's design plant, the best first. `beside`: of what was
-    logged and the law does not read. `spread`: of the certified machines.
+    logged and the law does not read; `logs`: all of them; `spread`: of the certified machines.
     """
     assert comparison.controller.design is not None
     values, noise = comparison.controller.design[1], float(comparison.f.size)
-    if comparison.misfit(model) <= WORTH * noise:
+    if (before := comparison.misfit(model)) <= WORTH * noise:
         return []
-    slopes = _find_slopes(comparison, spread, values, model)
-    fit = _Fit(comparison=comparison, leeway=spread.leave(slopes))
-    before = fit.solve(lambda _: model, []).left
-    if before <= WORTH * noise:  # draws explain it by themselves, and do not help to tell of what
+    slopes = find_slopes(comparison, spread, values, model)
+    left = SizeFit(comparison=comparison, leeway=spread.leave(slopes)).solve(lambda _: model, []).left
+    if left <= WORTH * noise:  # draws explain it by themselves, and do not help to tell of what
         spread, slopes = take_spread((), {}), slopes[:0]
-        fit, before = replace(fit, leeway=spread.leave(slopes)), comparison.misfit(model)
-    tried = [*_try_parameters(comparison, values, model, spread, slopes), *_try_shapes(fit, model)]
-    tried = [each for each in (*tried, *_try_rate(comparison, values, spread)) if each.left < before]
-    tried.sort(key=lambda each: each.rank)
-    kinds: list[list[_Tried]] = []
+    else:
+        before = left
+    case = Case(
+        comparison=comparison, beside=beside, logs=logs, values=values, spread=spread, model=model, slopes=slopes,
+        before=before,
+    )  # fmt: skip
+    tried = [*_try_parameters(case), *_try_shapes(case.fit, model), *_try_rate(comparison, values, spread)]
+    tried = sorted((each for each in tried if each.left < before), key=lambda each: each.rank)
+    if not tried:
+        return []
+    limit, told = _try_limit(case, tried)
+    if limit is not None:
+        tried = [limit, *tried] if told else sorted((*tried, limit), key=lambda each: each.rank)
+    kinds = _group(tried, noise)
+    if tried[0].left > WORTH * noise:
+        pairs = find_pairs(_list_starts(case, kinds, limit), _list_knobs(case), values, spread, noise)
+        kinds = [*([pair] for pair in pairs), *kinds]
+    return _list_found(case, kinds, told=told)
+
+
+def _group(tried: Sequence[Tried], noise: float) -> list[list[Tried]]:
+    """Return causes, those together that may be one."""
+    kinds: list[list[Tried]] = []
     for each in tried:
         twins = next((kind for kind in kinds if each.is_like(kind[0], noise)), None)
         if twins is None:
             kinds.append([each])
         else:
             twins.append(each)
-    found: list[Difference] = []
-    for first, *others in (_tell_apart(beside, values, kind) for kind in kinds[:MOST]):
-        share = 1.0 - max(first.left - noise, 0.0) / (before - noise)
-        also, values_of = (tuple(getattr(each.difference, key) for each in others) for key in ("name", "value"))
-        found.append(replace(first.difference, explains=share, alike=also, alike_values=values_of))
+    return kinds
+
+
+def _list_found(case: Case, kinds: Sequence[list[Tried]], *, told: bool) -> list[Difference]:
+    """Return what is listed: the best cause, those that the log does not tell from it, and, where it leaves more than
+    noise, those that explain half as much. `told`: what lies between the lines tells it from all others.
+    """
+    found, best = list[Difference](), kinds[0][0]
+    for kind in kinds[:MOST]:
+        first, *others = _tell_apart(case.beside, case.values, kind)
+        share, untold = case.share(first), not told and first.is_untold(best, case.noise)
+        in_part = best.left > WORTH * case.noise and share >= HALF * case.share(best)
+        if first is not best and kind is not kinds[0] and not untold and not in_part:
+            continue
+        alike = first.difference.alike + tuple(each.difference.name for each in others)
+        values = first.difference.alike_values + tuple(each.difference.value for each in others)
+        found.append(
+            replace(
+                first.difference,
+                explains=share,
+                alike=alike,
+                alike_values=values,
+                untold=untold and kind is not kinds[0],
+            )
+        )
     return found
 
 
-def _tell_apart(beside: Comparison, values: ParameterSet, kind: list[_Tried]) -> list[_Tried]:
+def _try_limit(case: Case, tried: Sequence[Tried]) -> tuple[Tried | None, bool]:
+    """Return a limit of the drive where a smaller gain explains much, or nothing explains all, and the log does not
+    exclude the limit; and whether what lies between the lines tells it from the best of what was tried.
+    """
+    smaller = any(
+        each.difference.kind == "gain" and 0.0 < each.difference.value < 1.0 and each.left <= HALF * case.before
+        for each in tried
+    )
+    if not smaller and tried[0].left <= WORTH * case.noise:
+        return None, False
+    limited, best = take_limited(case.comparison, case.logs), tried[0]
+    limit = try_limit(limited, case.values, case.spread)
+    if limit is None or limit.values is None or limit.left > RIVAL * max(best.left, case.noise):
+        return None, False
+    (its,) = find_distortion(limited, case.logs, [limit.values])
+    unlimited = replace(limited, controller=case.comparison.controller)
+    (others,) = find_distortion(unlimited, case.logs, [best.values or case.values])
+    if others * ALIKE <= its:
+        return None, False
+    return limit, its * ALIKE <= others
+
+
+def _list_knobs(case: Case) -> list[Knob]:
+    """Return what may be another one of the machine."""
+    parameters = [
+        Knob(kind="parameter", parameter=each)
+        for name, each in case.comparison.plant.complete(case.values).items()
+        if each.value and name not in DELAYS
+    ]
+    return [*parameters, make_delay(case.comparison.controller.sample_time_s)]
+
+
+def _list_starts(case: Case, kinds: Sequence[Sequence[Tried]], limit: Tried | None) -> list[Start]:
+    """Return the best of each kind of causes that a second can be tried beside."""
+    starts, knobs = list[Start](), {knob.parameter.name: knob for knob in _list_knobs(case)}
+    period = case.comparison.controller.sample_time_s
+    for kind in kinds:
+        for each in kind:
+            what, value = each.difference, each.difference.value
+            if what.kind == "parameter":
+                start = knobs[what.name], math.log(value), case.comparison
+            elif what.kind == "delay":
+                knob = make_delay(period)
+                start = knob, max(value / period, 0.0), case.comparison
+            elif each is limit:
+                limited = take_limited(case.comparison, case.logs)
+                start = make_knob(limited, value), 0.0, limited
+            else:
+                continue
+            starts.append(Start(knob=start[0], size=start[1], comparison=start[2], single=each))
+            break
+    return starts
+
+
+def _tell_apart(beside: Comparison, values: ParameterSet, kind: list[Tried]) -> list[Tried]:
     """Return causes that explain what the law reads as well as each other, the best first, without those that do not go
     with what was logged besides.
     """
@@ -140,124 +227,24 @@ def _tell_apart(beside: Comparison, values: ParameterSet, kind: list[_Tried]) ->
     return [kind[k] for k in order if left[k] <= ALIKE * left[order[0]]]
 
 
-@record(eq=False)
-class _Best:
-    """Sizes that fit best."""
-
-    sizes: Float[np.ndarray, " k"]
-    std: float  # of the first
-    left: float  # of the misfit
-    response: Lines
-
-
-@record(eq=False)
-class _Fit:
-    """A least-squares fit of a cause's sizes to the measured response, and of what certified machines differ by."""
-
-    comparison: Comparison
-    leeway: Leeway
-
-    def solve(self, make: Callable[[Any], Lines], start: Sequence[float], most: float = math.inf) -> _Best:
-        """Return the best sizes of what makes a response of sizes. `most`: that they may be."""
-        from scipy.optimize import least_squares  # deferred: 0.2 s
-
-        k, leeway, measured = len(start), self.leeway, self.comparison.response
-        std = self.comparison.std / math.sqrt(2.0)
-
-        def respond(x: Float[np.ndarray, " n"]) -> Lines:
-            return make(x[:k]) * np.exp(x[k:] @ leeway.directions)
-
-        def errors(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " r"]:
-            off = (measured - respond(x)) / std
-            return np.concatenate([off.real, off.imag, x[k:] / leeway.std])
-
-        first = np.array([*start, *(0.5 * (leeway.low + leeway.high))])  # at an edge the search would stay
-        if not first.size:
-            left = 0.5 * float(np.sum(errors(first) ** 2))
-            return _Best(sizes=first, std=math.inf, left=left, response=respond(first))
-        edges = [np.concatenate([np.full(k, sign * most), ends]) for sign, ends in ((-1, leeway.low), (1, leeway.high))]
-        scale = np.concatenate([np.maximum(np.abs(start), 1e-3), leeway.std])
-        solved = least_squares(errors, first, x_scale=scale, bounds=edges, max_nfev=200)
-        left, variance = float(solved.cost), np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True)[0, 0]
-        std_of_first = math.sqrt(max(left / measured.size, 1.0) * variance) if variance else math.inf
-        return _Best(sizes=solved.x[:k], std=std_of_first, left=left, response=respond(solved.x))
-
-
-def _find_slopes(comparison: Comparison, spread: Spread, values: ParameterSet, model: Lines) -> Slopes:
-    """Return what each value that was drawn adds to the logarithm of a model's response, for its own spread."""
-    moved = comparison.predict([place_values(comparison.plant, values, place) for place in spread.places])
-    return np.log(np.array(moved).reshape(-1, model.size) / model)
-
-
-@record(eq=False)
-class _Factor:
-    """A parameter's factor as far as it was found, and the response of the model with it."""
-
-    parameter: Parameter  # at its nominal value
-    log: float
-    model: Lines
-    slopes: Slopes  # of the values that were drawn
-    best: _Best | None = None
-
-    def place(self, values: ParameterSet, step: float = 0.0) -> ParameterSet:
-        """Return a plant's values with it, or a step of its logarithm further."""
-        value = self.parameter.value * math.exp(self.log + step)
-        return values.with_parameters(replace(self.parameter, value=value, min=-math.inf, max=math.inf))
-
-    def describe(self) -> Difference:
-        """Return it as a difference, with its interval where the log tells it."""
-        assert self.best is not None
-        far, value = 1.96 * self.best.std, math.exp(self.log)
-        low, high = (value * math.exp(-far), value * math.exp(far)) if far < MOST_SPREAD else (None, None)
-        name = self.parameter.name
-        return Difference(kind="parameter", name=name, value=value, low=low, high=high, unit="-", explains=0.0)
-
-
-def _try_parameters(
-    comparison: Comparison, values: ParameterSet, model: Lines, spread: Spread, slopes: Slopes
-) -> Iterator[_Tried]:
+def _try_parameters(case: Case) -> Iterator[Tried]:
     """Yield the parameters of the plant with the factors that fit best."""
-    moving = [
-        _Factor(parameter=each, log=0.0, model=model, slopes=slopes)
-        for name, each in comparison.plant.complete(values).items()
-        if each.value and name not in DELAYS
+    comparison, values, spread = case.comparison, case.values, case.spread
+    searches = [
+        Search(knobs=(knob,), sizes=np.zeros(1), model=case.model, slopes=case.slopes)
+        for knob in _list_knobs(case)
+        if knob.kind == "parameter"
     ]
-    done: list[_Factor] = []
-    for _ in range(ROUNDS):
-        before, after = moving, _step(comparison, spread, values, moving)
-        still = [abs(new.log - old.log) <= FOUND for new, old in zip(after, before, strict=True)]
-        done += [each for each, rests in zip(after, still, strict=True) if rests]
-        moving = [each for each, rests in zip(after, still, strict=True) if not rests]
-        models = comparison.predict([each.place(values) for each in moving]) if moving else []
-        moving = [replace(each, model=found) for each, found in zip(moving, models, strict=True)]
-    done = [each for each in (*done, *moving) if each.best is not None]
+    done = refine(comparison, spread, values, searches)
     least = min((each.best.left for each in done if each.best), default=0.0)
     for each in done:
         if spread.names and each.best and each.best.left <= RIVAL * least:
-            there = _find_slopes(comparison, spread, each.place(values), each.model)
-            (each,) = _step(comparison, spread, values, [replace(each, slopes=there)])
-        assert each.best is not None
-        yield _Tried(
-            difference=each.describe(), left=each.best.left, response=each.best.response, values=each.place(values)
-        )
+            there = find_slopes(comparison, spread, each.place(values), each.model)
+            (each,) = step(comparison, spread, values, [replace(each, slopes=there)])
+        yield each.conclude(values)
 
 
-def _step(comparison: Comparison, spread: Spread, values: ParameterSet, factors: Sequence[_Factor]) -> list[_Factor]:
-    """Return factors a step of Gauss and Newton further; as they are where they have no effect."""
-    changed = list[_Factor]()
-    for each, after in zip(factors, comparison.predict([each.place(values, STEP) for each in factors]), strict=True):
-        slope = (after - each.model) / STEP
-        if not np.any(slope) or not np.all(np.isfinite(slope)):
-            changed.append(each)
-            continue
-        fit = _Fit(comparison=comparison, leeway=spread.leave(each.slopes, each.parameter.name))
-        best = fit.solve(lambda x, each=each, slope=slope: each.model + x[0] * slope, [0.0], MOST_STEP)
-        log = float(np.clip(each.log + best.sizes[0], -MOST_LOG, MOST_LOG))
-        changed.append(replace(each, log=log, best=best))
-    return changed
-
-
-def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> Iterator[_Tried]:
+def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> Iterator[Tried]:
     """Yield the rate of the law's ticks that fits best, where timers run at such a one: a machine of other inertia and
     stiffness is like one at any. Law and log both go by ticks, so that the replay of a log whose clock counts them does
     not tell it; the machine goes by seconds, and its response does.
@@ -272,20 +259,20 @@ def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> I
 
     sliding = [comparison.misfit(replace(comparison, rate=rate).linearise(values)) for rate in USUAL_RATES]
     log = min(map(math.log, {*USUAL_RATES[:2], USUAL_RATES[int(np.nanargmin(sliding))]}), key=misfit)
-    best: _Best | None = None
+    best: Best | None = None
     for _ in range(ROUNDS):
         (model,), (after,) = at(log).predict([values]), at(log + STEP).predict([values])
         slope = (after - model) / STEP
         if not np.all(np.isfinite(slope)):
             return
-        leeway = spread.leave(_find_slopes(at(log), spread, values, model))
-        fit = _Fit(comparison=comparison, leeway=leeway)
+        leeway = spread.leave(find_slopes(at(log), spread, values, model))
+        fit = SizeFit(comparison=comparison, leeway=leeway)
         best = fit.solve(lambda x, model=model, slope=slope: model + x[0] * slope, [0.0], MOST_STEP)
         log += float(best.sizes[0])
         if abs(best.sizes[0]) <= FOUND:
             break
     assert best is not None
-    far = 1.96 * best.std
+    far = SURE * float(best.stds[0])
     rate = next((each for each in USUAL_RATES if abs(math.exp(log) / each - 1.0) <= SAME_RATE), None)
     if rate is None:
         return
@@ -294,23 +281,23 @@ def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> I
     difference = Difference(
         kind="rate", name="law", value=value, low=low, high=high, unit="Hz", explains=0.0, size=rate
     )  # fmt: skip
-    yield _Tried(difference=difference, left=best.left, response=best.response)
+    yield Tried(difference=difference, left=best.left, response=best.response)
 
 
-def _try_shapes(fit: _Fit, model: Lines) -> Iterator[_Tried]:
+def _try_shapes(fit: SizeFit, model: Lines) -> Iterator[Tried]:
     """Yield a gain, a delay and a mode, each with the size that fits best."""
     f = fit.comparison.f
     late = lambda x: model * np.exp(-2j * np.pi * f * x[0])  # noqa: E731
     for kind, unit, make, start in (("gain", "-", lambda x: model * x[0], 1.0), ("delay", "s", late, 0.0)):
         best = fit.solve(make, [start])
-        value, reach = float(best.sizes[0]), 1.96 * best.std
+        value, reach = float(best.sizes[0]), SURE * float(best.stds[0])
         low, high = value - reach, value + reach
         difference = Difference(kind=kind, name=kind, value=value, low=low, high=high, unit=unit, explains=0.0)
-        yield _Tried(difference=difference, left=best.left, response=best.response)
+        yield Tried(difference=difference, left=best.left, response=best.response)
     yield from _try_mode(fit, model)
 
 
-def _try_mode(fit: _Fit, model: Lines) -> Iterator[_Tried]:
+def _try_mode(fit: SizeFit, model: Lines) -> Iterator[Tried]:
     """Yield the mode that fits best: a mass on a spring beside the drive, or a pair of zeros and one of poles. The
     force that a mass on a spring takes of the motion is added to the inverse of the response without hold and delay.
     """
@@ -335,7 +322,7 @@ def _try_mode(fit: _Fit, model: Lines) -> Iterator[_Tried]:
         return pair(*take(x, 0)) / pair(*take(x, 2))
 
     misfit = np.abs((comparison.response - model) / comparison.std)
-    best: tuple[_Best, float | None] | None = None
+    best: tuple[Best, float | None] | None = None
     apart = np.where(misfit > SEEN, np.abs(comparison.response / model - 1.0), 0.0)
     for line in np.unique(np.concatenate([np.argsort(-misfit)[:2], np.argsort(-apart)[:2]])):
         at, scale = math.log(f[line]), 1.0 / abs(moved[line])
@@ -355,4 +342,4 @@ def _try_mode(fit: _Fit, model: Lines) -> Iterator[_Tried]:
             explains=0.0, size=size,
         )  # fmt: skip
         # it has some sizes where others have one
-        yield _Tried(difference=difference, left=found.left + 3.0, response=found.response)
+        yield Tried(difference=difference, left=found.left + 3.0, response=found.response)

@@ -50,11 +50,11 @@ class Spread:
         """One value each, beyond the nominal one by its spread."""
         return [{name: at + size} for name, at, size in zip(self.names, self.nominal, self.sizes, strict=True)]
 
-    def leave(self, slopes: Complex[np.ndarray, "n m"], name: str | None = None) -> Leeway:
-        """Return the leeway of all values but one, whose size is sought. `slopes`: what each place adds to the
+    def leave(self, slopes: Complex[np.ndarray, "n m"], *names: str) -> Leeway:
+        """Return the leeway of all values but those whose size is sought. `slopes`: what each place adds to the
         logarithm of the response.
         """
-        kept = [i for i, each in enumerate(self.names) if each != name]
+        kept = [i for i, each in enumerate(self.names) if each not in names]
         if not kept:
             none = np.zeros(0)
             return Leeway(directions=slopes[kept], std=none, low=none, high=none)

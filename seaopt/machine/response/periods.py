@@ -23,6 +23,7 @@ MOST_LAGS = 50  # that are the likeliest periods, by either measure
 REPEATS = 0.2  # of the rows, that repeat after a period at least
 SAME = 1e-4  # of the reference's range: rows that are alike
 WEAKEST = 1e-2  # of the strongest line
+NOT_PLAYED = 1e-3  # of the strongest line: what a rounded reference has where it has nothing
 STAYS = 0.9  # of the ticks at the limit: a loop that ran away, and no amplitude that is too large
 NEAR_UNSTABLE = (
     "or, where the amplitude is the one that was planned, the loop is near its limit of stability or beyond: check the "
@@ -71,7 +72,9 @@ class Blocks:
     period_s: float
     amplitude: float  # rms of the reference about its mean
     swing: float  # the most by which the effort swings about its middle in the periods of a log
+    noise: float  # std of the command from period to period of one set of phases; 0 where there is one of each
     left_out: LeftOut
+    between: Complex[np.ndarray, "b k"]  # what is regulated, where the reference has nothing: noise and distortion
 
     @property
     def realisations(self) -> int:
@@ -82,12 +85,15 @@ class Blocks:
         """Return one row per stretch, the mean of its periods."""
         kinds = np.unique(self.realisation)
         rows = [self.realisation == kind for kind in kinds]
-        reference, effort, measured = (
+        reference, effort, measured, between = (
             np.array([part[chosen].mean(axis=0) for chosen in rows])
-            for part in (self.reference, self.effort, self.measured)
+            for part in (self.reference, self.effort, self.measured, self.between)
         )
         beside = {name: np.array([part[chosen].mean(axis=0) for chosen in rows]) for name, part in self.beside.items()}
-        return replace(self, reference=reference, effort=effort, measured=measured, beside=beside, realisation=kinds)
+        return replace(
+            self, reference=reference, effort=effort, measured=measured, beside=beside, between=between,
+            realisation=kinds,
+        )  # fmt: skip
 
 
 def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
@@ -269,6 +275,7 @@ def _transform(
     strength[0] = 0.0
     lines = np.flatnonzero(strength > WEAKEST * np.max(strength))
     lines = lines[lines < (period - 1) // 2]
+    between = np.flatnonzero(strength <= NOT_PLAYED * np.max(strength))[1:]
     scale = 2.0 / period
     return Blocks(
         f=lines * ticks.rate_hz / period,
@@ -281,8 +288,18 @@ def _transform(
         period_s=period / ticks.rate_hz,
         amplitude=float(np.sqrt(0.5 * np.mean(np.sum(np.abs(scale * reference[:, lines]) ** 2, axis=1)))),
         swing=float(np.ptp(ticks.command[rows])) / 2.0 / abs(controller.per_effort),
+        noise=_find_noise(ticks.command[rows], [number for _, number in starts]),
         left_out=left_out,
+        between=scale * measured[:, 0, between],
     )
+
+
+def _find_noise(command: Float[np.ndarray, "b n"], numbers: Sequence[int]) -> float:
+    """Return the std of a command about its mean over the periods of each set of phases."""
+    groups = [command[np.array(numbers) == number] for number in sorted(set(numbers))]
+    free = sum(len(group) - 1 for group in groups) * command.shape[1]
+    left = sum(float(np.sum((group - group.mean(axis=0)) ** 2)) for group in groups)
+    return math.sqrt(left / free) if free else 0.0
 
 
 def join_blocks(parts: Sequence[Blocks]) -> list[Blocks]:
@@ -310,9 +327,11 @@ def _join(group: Sequence[Blocks]) -> Blocks:
         reference=np.concatenate([part.reference for part in group]),
         effort=np.concatenate([part.effort for part in group]),
         measured=np.concatenate([part.measured for part in group]),
+        between=np.concatenate([part.between[:, : min(each.between.shape[1] for each in group)] for part in group]),
         beside={name: np.concatenate([part.beside[name] for part in group]) for name in sorted(names)},
         realisation=np.concatenate([part.realisation + at for part, at in zip(group, offsets, strict=True)]),
         amplitude=float(np.mean([part.amplitude for part in group])),
         swing=max(part.swing for part in group),
+        noise=max(part.noise for part in group),
         left_out=sum((part.left_out for part in group), LeftOut()),
     )

@@ -1,0 +1,123 @@
+"""Two causes at once, where one alone leaves of the difference what is no noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.machine.differences.comparison import TOLERATED, Comparison
+from seaopt.machine.differences.leeway import Spread
+from seaopt.machine.differences.size_fit import UNTOLD, Difference, Tried
+from seaopt.machine.differences.size_search import ROUNDS, Knob, Search, find_slopes, refine
+from seaopt.parameters import ParameterSet
+from seaopt.records import record
+
+BEGUN = 2  # rounds of the search of each pair, before the best of them go on
+FIRST = 3  # single causes that a second is tried beside
+REFINED = 8  # pairs that are searched to the end
+MORE_ROUNDS = 2 * ROUNDS  # of a search along two sizes at once
+HALVES = 0.5  # of what one cause leaves, that two are to leave at most
+
+
+@record(eq=False)
+class Start:
+    """A single cause from which pairs are tried: what moves it, its size, the model that has it, and what it leaves."""
+
+    knob: Knob
+    size: float
+    comparison: Comparison
+    single: Tried
+
+
+def find_pairs(
+    starts: Sequence[Start], knobs: Sequence[Knob], values: ParameterSet, spread: Spread, noise: float
+) -> list[Tried]:
+    """Return the pairs of causes that explain much more than the best single one, the best first, those that are as
+    good beside it. `knobs`: of the second causes; `noise`: what it leaves of the misfit.
+    """
+    late = [start for start in starts[FIRST:] if start.knob.kind == "delay"]  # what most often comes second
+    searches = [(start, each) for start in (*starts[:FIRST], *late) for each in _begin(start, knobs, values, spread)]
+    searches.sort(key=lambda pair: pair[1].best.left if pair[1].best else np.inf)
+    found, seen = list[Tried](), list[set[str]]()
+    for start, search in searches:
+        if {*search.names} in seen:
+            continue
+        if len(seen) == REFINED:
+            break
+        seen.append({*search.names})
+        found += _search_on(start, search, values, spread)
+    least = min(start.single.left for start in starts)
+    found = [each for each in found if _is_worth(each, least, noise)]
+    found.sort(key=lambda each: each.left)
+    return _fold([each for each in found if each.is_untold(found[0], noise)])
+
+
+def _begin(start: Start, knobs: Sequence[Knob], values: ParameterSet, spread: Spread) -> list[Search]:
+    """Return a single cause with each of the others beside it, some rounds of the search from none of these on."""
+    comparison, knob = start.comparison, start.knob
+    (model,) = comparison.predict([knob.place(values, start.size)])
+    slopes = find_slopes(comparison, spread, knob.place(values, start.size), model)
+    begun = [
+        Search(knobs=(knob, other), sizes=np.array([start.size, 0.0]), model=model, slopes=slopes)
+        for other in knobs
+        if other.parameter.name != knob.parameter.name
+    ]
+    return refine(comparison, spread, values, begun, BEGUN)
+
+
+def _search_on(start: Start, search: Search, values: ParameterSet, spread: Spread) -> list[Tried]:
+    """Return a pair as far as it comes."""
+    found = refine(start.comparison, spread, values, [search], MORE_ROUNDS)
+    if not found or not spread.names:
+        return [each.conclude(values) for each in found]
+    (pair,) = found
+    there = find_slopes(start.comparison, spread, pair.place(values), pair.model)
+    return [
+        each.conclude(values) for each in refine(start.comparison, spread, values, [replace(pair, slopes=there)], 2)
+    ]
+
+
+def _is_worth(pair: Tried, single: float, noise: float) -> bool:
+    """Tell whether two causes explain much more than one, and both are there."""
+    gained = single - pair.left > 2.0 * UNTOLD * max(pair.left / noise, 1.0)
+    parts = (pair.difference, *pair.difference.beside)
+    return gained and pair.left <= HALVES * single and all(_is_there(part) for part in parts)
+
+
+def _is_there(part: Difference) -> bool:
+    """Tell whether the interval of a difference excludes that there is none."""
+    none = {"parameter": 1.0, "delay": 0.0}.get(part.kind, np.inf)
+    return part.low is not None and part.high is not None and not part.low <= none <= part.high
+
+
+def _fold(pairs: Sequence[Tried]) -> list[Tried]:
+    """Return pairs, those of one response as one: what only one of two causes differs in, as alike to that."""
+    kept = list[Tried]()
+    for pair in pairs:
+        mine = _name_parts(pair.difference)
+        for k, other in enumerate(kept):
+            its = _name_parts(other.difference)
+            apart = [(a, b) for a in mine for b in its if a not in its and b not in mine]
+            if len(apart) == 1 and np.max(np.abs(pair.response / other.response - 1.0)) <= TOLERATED:
+                kept[k] = replace(other, difference=_add_alike(other.difference, apart[0][1], mine[apart[0][0]]))
+                break
+        else:
+            kept.append(pair)
+    return kept
+
+
+def _name_parts(difference: Difference) -> Mapping[str, Difference]:
+    return {part.name: part for part in (difference, *difference.beside)}
+
+
+def _add_alike(difference: Difference, name: str, other: Difference) -> Difference:
+    """Return a difference in which one of the parts has another beside it that would explain as much."""
+    if difference.name == name:
+        alike, sizes = (*difference.alike, other.name), (*difference.alike_values, other.value)
+        return replace(difference, alike=alike, alike_values=sizes)
+    return replace(
+        difference,
+        beside=tuple(_add_alike(part, name, other) if part.name == name else part for part in difference.beside),
+    )

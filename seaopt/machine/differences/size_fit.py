@@ -1,0 +1,112 @@
+"""A cause with its size as it is found, and the least-squares fit of sizes beside what certified machines differ by."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.machine.differences.comparison import TOLERATED, Comparison, Lines
+from seaopt.machine.differences.leeway import Leeway
+from seaopt.parameters import ParameterSet
+from seaopt.records import record
+
+# Of the misfit, in what noise leaves of a line: twice the difference of two causes is a chi square, 99.9 %.
+UNTOLD = 5.4
+MODE_COST = 2.0  # by which a mode, of several sizes, has to leave less than another cause does
+RATE_COST = 2.0  # by which a usual rate may leave more than another cause does
+
+
+@record
+class Difference:
+    """A way in which the machine differs, its size, and how much of the difference it explains."""
+
+    kind: str  # parameter, gain, delay, mode, range, rate, drive limit
+    name: str  # the parameter, the signal
+    value: float  # factor of a parameter or gain; seconds; Hz of a mode, of the law's ticks; the range; the limit
+    low: float | None
+    high: float | None
+    unit: str
+    explains: float  # share of the misfit, of what no certified machine has
+    alike: tuple[str, ...] = ()  # parameters that would explain as much
+    alike_values: tuple[float, ...] = ()  # their factors
+    size: float | None = None  # of a mode: its zero's frequency over its pole's; of a rate: over that of the log
+    beside: tuple[Difference, ...] = ()  # what differs besides, of two that explain it together
+    untold: bool = False  # the log does not tell it from the one that is named first
+
+
+@record(eq=False)
+class Tried:
+    """A cause with the size that fits best, and the misfit that it leaves."""
+
+    difference: Difference
+    left: float
+    response: Lines
+    values: ParameterSet | None = None  # of the plant, where a parameter is the cause
+
+    def is_like(self, other: Tried, noise: float) -> bool:
+        """Tell whether two causes may be one, both factors of parameters or gains: the log does not tell them apart, or
+        their responses differ by less than a machine and its model do. `noise`: what it leaves of the misfit.
+        """
+        mine, its = self.difference, other.difference
+        if not (mine.unit == its.unit == "-" and {mine.kind, its.kind} <= {"parameter", "gain"}):
+            return False
+        return self.is_untold(other, noise) or bool(np.max(np.abs(self.response / other.response - 1.0)) <= TOLERATED)
+
+    def is_untold(self, best: Tried, noise: float) -> bool:
+        """Tell whether the log does not tell a cause from the best one."""
+        return self.left - best.left <= UNTOLD * max(best.left / noise, 1.0)
+
+    @property
+    def rank(self) -> float:
+        """What it leaves, times what its kind costs."""
+        if self.difference.kind == "rate":
+            return self.left / RATE_COST
+        return self.left * (MODE_COST if self.difference.kind == "mode" else 1.0)
+
+
+@record(eq=False)
+class Best:
+    """Sizes that fit best."""
+
+    sizes: Float[np.ndarray, " k"]
+    stds: Float[np.ndarray, " k"]
+    left: float  # of the misfit
+    response: Lines
+
+
+@record(eq=False)
+class SizeFit:
+    """A least-squares fit of a cause's sizes to the measured response, and of what certified machines differ by."""
+
+    comparison: Comparison
+    leeway: Leeway
+
+    def solve(self, make: Callable[[Any], Lines], start: Sequence[float], most: float = math.inf) -> Best:
+        """Return the best sizes of what makes a response of sizes. `most`: that they may be."""
+        from scipy.optimize import least_squares  # deferred: 0.2 s
+
+        k, leeway, measured = len(start), self.leeway, self.comparison.response
+        std = self.comparison.std / math.sqrt(2.0)
+
+        def respond(x: Float[np.ndarray, " n"]) -> Lines:
+            return make(x[:k]) * np.exp(x[k:] @ leeway.directions)
+
+        def errors(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " r"]:
+            off = (measured - respond(x)) / std
+            return np.concatenate([off.real, off.imag, x[k:] / leeway.std])
+
+        first = np.array([*start, *(0.5 * (leeway.low + leeway.high))])  # at an edge the search would stay
+        if not first.size:
+            left = 0.5 * float(np.sum(errors(first) ** 2))
+            return Best(sizes=first, stds=first, left=left, response=respond(first))
+        edges = [np.concatenate([np.full(k, sign * most), ends]) for sign, ends in ((-1, leeway.low), (1, leeway.high))]
+        scale = np.concatenate([np.maximum(np.abs(start), 1e-3), leeway.std])
+        solved = least_squares(errors, first, x_scale=scale, bounds=edges, max_nfev=200)
+        left, variances = float(solved.cost), np.diag(np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True))[:k]
+        stds = np.sqrt(max(left / measured.size, 1.0) * variances) * self.comparison.widening
+        stds = np.where(variances > 0.0, stds, np.inf)
+        return Best(sizes=solved.x[:k], stds=stds, left=left, response=respond(solved.x))

@@ -1,0 +1,137 @@
+"""The size of a cause, or of two at once, searched on the model of the machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from seaopt.control.loops.sampled_plant import DELAY
+from seaopt.machine.differences.comparison import Comparison, Lines
+from seaopt.machine.differences.leeway import Spread
+from seaopt.machine.differences.size_fit import Best, Difference, SizeFit, Tried
+from seaopt.parameters import Parameter, ParameterSet
+from seaopt.records import record
+from seaopt.robustness.uncertainty.worst import place_values
+
+STEP = 0.02  # of a size, to see what it does
+ROUNDS = 4  # of Gauss and Newton
+FOUND = 1e-3  # a size is found where it moves by less
+MOST_STEP = 0.5  # of it, in a round
+MOST_LOG = 1.5  # of a factor: its logarithm goes no further
+MOST_SPREAD = 10.0  # of a factor's logarithm, above which the log does not tell the factor
+SURE = 1.96  # std, of 95 %
+
+Slopes = Complex[np.ndarray, "n m"]
+
+
+@record(eq=False)
+class Knob:
+    """What a cause changes of the machine: a parameter's factor, whose size is its logarithm, or the delay, in sample
+    times.
+    """
+
+    kind: str  # parameter, drive limit, delay
+    parameter: Parameter  # at the value that its size counts from
+    sample_time_s: float = 1.0
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Between which its size lies."""
+        return (0.0, math.inf) if self.kind == "delay" else (-MOST_LOG, MOST_LOG)
+
+    def place(self, values: ParameterSet, size: float) -> ParameterSet:
+        """Return a plant's values with it."""
+        late = self.sample_time_s * size
+        value = late if self.kind == "delay" else self.parameter.value * math.exp(size)
+        return values.with_parameters(replace(self.parameter, value=value, min=-math.inf, max=math.inf))
+
+    def describe(self, size: float, std: float) -> Difference:
+        """Return it as a difference, with its interval where the log tells it."""
+        far = SURE * std
+        name = self.parameter.name
+        sizes = (size, size - far, size + far)
+        if self.kind == "delay":
+            value, low, high = (self.sample_time_s * each for each in sizes)
+            return Difference(kind="delay", name="delay", value=value, low=low, high=high, unit="s", explains=0.0)
+        scale, unit = (self.parameter.value, self.parameter.unit) if self.kind == "drive limit" else (1.0, "-")
+        value, *edges = (scale * math.exp(min(each, MOST_SPREAD)) for each in sizes)
+        low, high = edges if far < MOST_SPREAD else (None, None)
+        return Difference(kind=self.kind, name=name, value=value, low=low, high=high, unit=unit, explains=0.0)
+
+
+def make_delay(sample_time_s: float) -> Knob:
+    """Return the delay beyond that which was certified."""
+    return Knob(kind="delay", parameter=Parameter(name=DELAY, value=0.0, unit="s"), sample_time_s=sample_time_s)
+
+
+@record(eq=False)
+class Search:
+    """The sizes of one cause, or of several at once, as far as they were found, and the response of the model there."""
+
+    knobs: tuple[Knob, ...]
+    sizes: Float[np.ndarray, " k"]
+    model: Lines
+    slopes: Slopes  # of the values that were drawn
+    best: Best | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that it moves."""
+        return tuple(knob.parameter.name for knob in self.knobs)
+
+    def place(self, values: ParameterSet, ahead: int | None = None) -> ParameterSet:
+        """Return a plant's values with the causes, one of them a step ahead."""
+        for k, (knob, size) in enumerate(zip(self.knobs, self.sizes.tolist(), strict=True)):
+            values = knob.place(values, size + (STEP if k == ahead else 0.0))
+        return values
+
+    def conclude(self, values: ParameterSet) -> Tried:
+        """Return what was found: the first cause, with the others beside it."""
+        assert self.best is not None
+        parts = zip(self.knobs, self.sizes.tolist(), self.best.stds.tolist(), strict=True)
+        first, *others = (knob.describe(size, std) for knob, size, std in parts)
+        difference = replace(first, beside=tuple(others))
+        return Tried(difference=difference, left=self.best.left, response=self.best.response, values=self.place(values))
+
+
+def find_slopes(comparison: Comparison, spread: Spread, values: ParameterSet, model: Lines) -> Slopes:
+    """Return what each value that was drawn adds to the logarithm of a model's response, for its own spread."""
+    moved = comparison.predict([place_values(comparison.plant, values, place) for place in spread.places])
+    return np.log(np.array(moved).reshape(-1, model.size) / model)
+
+
+def refine(
+    comparison: Comparison, spread: Spread, values: ParameterSet, searches: Sequence[Search], rounds: int = ROUNDS
+) -> list[Search]:
+    """Return searches as far as they come, without those that have no effect."""
+    moving, done = list(searches), list[Search]()
+    for _ in range(rounds):
+        before, after = moving, step(comparison, spread, values, moving)
+        still = [bool(np.all(np.abs(a.sizes - b.sizes) <= FOUND)) for a, b in zip(after, before, strict=True)]
+        done += [each for each, rests in zip(after, still, strict=True) if rests]
+        moving = [each for each, rests in zip(after, still, strict=True) if not rests]
+        models = comparison.predict([each.place(values) for each in moving]) if moving else []
+        moving = [replace(each, model=found) for each, found in zip(moving, models, strict=True)]
+    return [each for each in (*done, *moving) if each.best is not None]
+
+
+def step(comparison: Comparison, spread: Spread, values: ParameterSet, searches: Sequence[Search]) -> list[Search]:
+    """Return searches a step of Gauss and Newton further; as they are where they have no effect."""
+    ahead = [each.place(values, k) for each in searches for k in range(len(each.knobs))]
+    models, changed = iter(comparison.predict(ahead)), list[Search]()
+    for each in searches:
+        slopes = np.array([(next(models) - each.model) / STEP for _ in each.knobs])
+        if not np.all(np.any(slopes, axis=1)) or not np.all(np.isfinite(slopes)):
+            changed.append(each)
+            continue
+        fit = SizeFit(comparison=comparison, leeway=spread.leave(each.slopes, *each.names))
+        start = [0.0] * len(each.knobs)
+        best = fit.solve(lambda x, each=each, slopes=slopes: each.model + x @ slopes, start, MOST_STEP)
+        ends = np.array([knob.ends for knob in each.knobs])
+        sizes = np.clip(each.sizes + best.sizes, ends[:, 0], ends[:, 1])
+        changed.append(replace(each, sizes=sizes, best=best))
+    return changed

@@ -1,0 +1,66 @@
+"""Two faults at once, on machines of the tests' own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from tests.machine.simulator import Machine
+from tests.machine.test_drive_limit import REFERENCE
+
+RIGHT = Machine()
+RANGES = {"eta": (0.98, 1.02), "b_r": (0.95 * 1.31e-4, 1.05 * 1.31e-4)}
+
+
+def accept(controller, log):
+    return so.accept(controller, [log], uncertainty=so.plants.thor(), ranges=RANGES)
+
+
+def scale(**factors):
+    return replace(RIGHT, **{name: factor * getattr(RIGHT, name) for name, factor in factors.items()})
+
+
+def find_part(difference, *names):
+    """Return the part of a difference that has one of these names, and the factor under it."""
+    for part in (difference, *difference.beside):
+        alike = dict(zip((part.name, *part.alike), (part.value, *part.alike_values), strict=True))
+        if found := [alike[name] for name in names if name in alike]:
+            return part, found[0]
+    raise AssertionError((names, difference))
+
+
+@pytest.mark.parametrize(
+    ("fault", "names"),
+    [({"damping": 2.0}, ("b_r",)), ({"per_ampere": 0.8}, ("eta", "K_tau")), ({"stiffness": 0.8}, ("k",))],
+)
+def test_a_later_loop_and_another_fault_are_named_together(controller, bench, fault, names):
+    ((_, factor),) = fault.items()
+    off = list[float]()
+    for seed in (2, 3):
+        log = bench.log(replace(scale(**fault), delay_s=1.2e-3), REFERENCE, noise=2.0, seed=seed)
+        result = accept(controller, log)
+        first = result.differences.found[0]
+        delay, other = find_part(first, "delay")[0], find_part(first, *names)
+        assert first.explains > 0.95 and len(first.beside) == 1, first
+        assert abs(delay.value / 1.2e-3 - 1.0) < 0.03 and delay.high - delay.low < 1.5e-4, delay
+        assert abs(other[1] / factor - 1.0) < 0.02, other
+        off.append(3.92 * (delay.value - 1.2e-3) / (delay.high - delay.low))
+        text = " ".join(str(result).split())
+        assert " ms later than certified" in text and ", and " in text
+    assert np.sum(np.square(off)) < 10.6, off  # chi square of 2, 99.5 %
+
+
+def test_a_limited_drive_beside_a_softer_spring(controller, bench):
+    machine = replace(scale(stiffness=0.8), drive_limit=1.5)
+    first = accept(controller, bench.log(machine, REFERENCE, noise=0.5)).differences.found[0]
+    limit, spring = find_part(first, "drive_limit")[0], find_part(first, "k")
+    assert limit.low <= 1.5 <= limit.high and abs(spring[1] / 0.8 - 1.0) < 0.05, first
+
+
+@pytest.mark.parametrize("fault", [{"damping": 2.0}, {"stiffness": 0.8}])
+def test_one_fault_alone_has_no_second_beside_it(controller, bench, fault):
+    found = accept(controller, bench.log(scale(**fault), REFERENCE, noise=0.5)).differences.found
+    assert not any(each.beside for each in found), found
