@@ -39,7 +39,7 @@ FIRST_RADIUS = 0.3  # over the size of the first point
 ROUNDING_DECREMENT = 1e-4  # squared standard deviations that rounding may leave of residuals that are rounding
 UNSEEN = 1e-14  # of the largest eigenvalue; directions below it are left where they are
 ROUNDING_RADIUS = 1e-15  # of the size of the point
-FLAT_STEPS = 6  # in a row that leave the cost as it is
+FLAT_STEPS = 6  # in a row that leave the cost as it is, or jump where they are to
 LOST_STEPS, GAIN = 8, 1e-2  # to where the cost is not finite, since it last fell by such a share of what is left
 NEAR_ENOUGH = 0.25  # squared standard deviations that the slope leaves where the cost is flat
 STRAIGHT_RATIO = 2e-5  # distance over the one before, squared: H changes by a few times that over the step to come
@@ -90,8 +90,8 @@ def minimise(
     called with the model after each iteration; `follow`: (model, z) -> what it says of a z nearby if residuals are
     straight from there: then a last step needs no evaluation of its own once the whole steps before it have shown how
     straight they are; `before`: of the search that this one goes on from; `flat`: share of the cost that is no change:
-    a few steps in a row that make none end a search among kinks, whose gradient does not die out; `ends`: tells of each
-    point whether it is all that is asked for.
+    a few steps in a row that make none, or that should make none and go up, end a search among kinks and jumps, whose
+    gradient does not die out; `ends`: tells of each point whether it is all that is asked for.
     """
     current = objective.evaluate(np.clip(start, low, high)) if isinstance(start, np.ndarray) else start
     if not np.isfinite(current.cost):
@@ -121,7 +121,8 @@ def minimise(
                 evaluation=current,
                 status="converged" if distance <= NEAR_ENOUGH else "stalled",
                 iterations=iteration - 1,
-                message=f"the cost is flat, and {np.sqrt(distance):.1g} standard deviations are left by its slope",
+                message=f"the cost is flat or jumps, and {np.sqrt(distance):.1g} standard deviations are left by its "
+                "slope",
             )
         if lost >= LOST_STEPS:
             message = "the search goes where the plant cannot be simulated; start closer, or give bounds"
@@ -163,7 +164,9 @@ def minimise(
         lost += not np.isfinite(trial.cost)
         if trial.cost < best - max(GAIN * 0.5 * distance, NEAR_ENOUGH):
             lost, best = 0, trial.cost
-        unchanged = unchanged + 1 if flat > 0.0 and abs(trial.cost - current.cost) <= flat * current.cost else 0
+        # So short a step rises only where the cost jumps, and the next one does not get over that either.
+        change_of_cost = min(abs(trial.cost - current.cost), predicted if ratio < 0.0 else np.inf)
+        unchanged = unchanged + 1 if flat > 0.0 and change_of_cost <= flat * current.cost else 0
         if ratio < 0.25:
             radius = 0.25 * min(radius, length) if length > 0.0 else 0.25 * radius
         elif ratio > 0.75 or damping == 0.0:
@@ -177,7 +180,7 @@ def minimise(
             message = "what was asked for is found"
             return Solution(z=current.z, evaluation=current, status="converged", message=message, iterations=iteration)
     return Solution(
-        z=current.z, evaluation=current, status="max_iterations", iterations=max_iterations, message=STILL_MOVING
+        z=current.z, evaluation=current, status="max_iterations", iterations=iteration - 1, message=STILL_MOVING
     )
 
 

@@ -238,3 +238,32 @@ def test_a_search_ends_where_it_goes_to_what_cannot_be_simulated():
     solution = minimise(near, start, -bounds, bounds)
     assert solution.status == "converged" and not solution.lost
     assert solution.z[0] == pytest.approx(0.01, abs=1e-6)
+
+
+class Cliff:
+    """A thousand, half the squared distance to 1 in standard deviations, and a jump just beyond `edge`."""
+
+    def __init__(self, edge, jump):
+        self.edge, self.jump, self.calls = edge, jump, []
+
+    def evaluate(self, z):
+        self.calls.append(float(z[0]))
+        left = z[0] - 1.0
+        return QuadraticModel(
+            z=z, cost=1e3 + 0.5 * left**2 + self.jump * (z[0] > self.edge), gradient=np.array([left]),
+            hessian=np.eye(1), linear=np.zeros(1, dtype=bool),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("edge", "jump", "status"), [(0.6, 0.2, "converged"), (0.2, 0.4, "stalled"), (0.2, 0.0, "converged")]
+)
+def test_a_search_ends_where_its_cost_jumps_by_more_than_its_slope_gains(edge, jump, status):
+    """Once: 20 steps and more, down to what is lost in rounding, and stalled wherever that was."""
+    bounds, cliff = np.full(1, np.inf), Cliff(edge, jump)
+    solution = minimise(cliff, np.array([edge]), -bounds, bounds, flat=1e-6)
+    assert solution.status == status
+    assert solution.z[0] == pytest.approx(edge if jump else 1.0)
+    assert len(cliff.calls) < 15
+    if jump:
+        assert f"{1.0 - edge:.1g} standard deviations" in solution.message
