@@ -41,12 +41,13 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
         return
     colour = measure_colour(fit.covariance, fit.white_covariance)
     try:
+        there = problem.evaluate(minimum.z)
         solved = _search(fit, minimum, 2.0 * ENOUGH * colour)
     except SeaoptError:  # what cannot be simulated is no minimum
         return
     if solved is None or not np.isfinite(solved.misfit):
         return
-    gain = 0.5 * (measure_misfit(problem.evaluate(minimum.z)) - solved.misfit) / colour
+    gain = 0.5 * (measure_misfit(there) - solved.misfit) / colour
     values = problem.unknowns.by_name(solved.solution.z)
     moved = _find_moved(fit, values)
     if not moved or gain < -ENOUGH:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import count
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +20,7 @@ from seaopt.estimation.judgement.score_test import ScoreTest
 from seaopt.estimation.judgement.second_log import FAR
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import measure_spread
-from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, pose_problem
+from seaopt.estimation.problem.fit_problem import BudgetError, Evaluation, FitProblem, pose_problem
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
@@ -49,6 +48,7 @@ SOLVED = 0.02  # of the residual's power of a poor fit: what leaves less is the 
 HALVED = 0.5  # of a residual's power: what leaves less is another explanation, wherever the estimates are
 MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
 HOPELESS, PATIENCE = 1.4, 8  # a misfit that is larger by so much of the samples, after so many iterations, stays so
+STILL, SLIGHT = 5, 0.1  # iterations in a row that gain so little of misfit end a refit: where a delay's slope has kinks
 SURE = 2.5  # standard deviations by which one of two is nearer to held-out samples
 PROMISES = 0.5  # of a gain that counts: what shows with coarse steps, the same in fit and refit, before finer are made
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
@@ -95,15 +95,17 @@ def find_causes(
     minimum = fit.require_minimum("find_causes")
     fitted = minimum.problem.evaluate(minimum.z)
     whole = _measure_powers(fitted, minimum.problem)
+    colour = measure_colour(fit.covariance, fit.white_covariance)
+    causes = list(_weigh_hypotheses(fit, hypotheses, whole, colour))
+    candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor, noticed=noticed))
     # Steps as coarse as the residual allows, until a refit is worth finer ones.
     coarse, rough = minimum.problem, fitted
     if not _is_near_noise(fit) and not coarse.predicts:
-        coarse, rough = coarsen(coarse, minimum.z)
-        rough = settle_roughly(coarse, rough, checked=True).solution.evaluation
-    colour = measure_colour(fit.covariance, fit.white_covariance)
-    causes: list[Cause] = []
-    candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor, noticed=noticed))
-    causes += _weigh_hypotheses(fit, hypotheses, whole, colour)
+        try:
+            coarse, rough = coarsen(coarse, minimum.z)
+            rough = settle_roughly(coarse, rough, checked=True).solution.evaluation
+        except BudgetError:
+            candidates = []
     explained = False
     for number, candidate in enumerate(candidates, start=1):
         if candidate.further and not explained:
@@ -119,6 +121,8 @@ def find_causes(
                 continue
             before = _measure_kept(fit, minimum.problem, minimum.z, candidate.kept) if candidate.kept else whole
             solved = refine_to(solved, minimum.problem)
+        except BudgetError:
+            break
         except SeaoptError:  # what does not make a problem explains nothing
             continue
         cause = _weigh(fit, candidate, solved.problem, solved.solution.evaluation, before, colour, poor=poor)
@@ -219,10 +223,12 @@ def _refit(minimum: Minimum, candidate: Candidate, coarse: FitProblem, most: flo
         start = min(start, problem.evaluate(other), key=lambda evaluation: evaluation.cost)
     plants = {e.data.plant for e in old.experiments}
     checked = all(e.data.plant in plants for e in problem.experiments)
-    tried = count(1)
+    misfits = [measure_misfit(start)]
 
     def ends(evaluation: Evaluation) -> bool:
-        return next(tried) > PATIENCE and measure_misfit(evaluation) > most
+        misfits.append(measure_misfit(evaluation))
+        still = len(misfits) > STILL and misfits[-1] > misfits[-1 - STILL] - SLIGHT
+        return still or (len(misfits) > 1 + PATIENCE and misfits[-1] > most)
 
     def solve(problem: FitProblem, start: Evaluation) -> Solved:
         return settle_roughly(problem, start, ends=ends, checked=checked)

@@ -9,8 +9,10 @@ best three are joined with each other, and then with every other one, two in all
 a pair often gets on where its parts got stuck, so that either is then tried alone from there; and beside one that would
 be taken alone it has to remove all of the excess that is left.
 
-What this may cost is counted (`budget`). A refit that asks for integration steps out of proportion to the fit's is left
-undecided: bristles that slip fast are so stiff, and their search often ends in no minimum.
+What this may cost is counted (`budget`): refits begin as long as the search's share lasts, and the best of them is
+settled, and parted where it is a pair, from what the whole judgement has left. A refit that asks for integration steps
+out of proportion to the fit's is left undecided: bristles that slip fast are so stiff, and their search often ends in
+no minimum. So is a pair whose parts are not tried because nothing is left.
 """
 
 from __future__ import annotations
@@ -25,7 +27,14 @@ import numpy as np
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Change, Hypothesis, change_plants, measure_sizes
 from seaopt.estimation.problem.experiment import Experiment
-from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem, count_evaluations, pose_problem
+from seaopt.estimation.problem.fit_problem import (
+    BudgetError,
+    Evaluation,
+    FitProblem,
+    count_evaluations,
+    count_left,
+    pose_problem,
+)
 from seaopt.estimation.problem.noise_floor import NoiseFloor, measure_floors
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
@@ -125,6 +134,7 @@ class Search:
     # All unknowns of a refit that removes a large excess in part, or of one that chance hardly makes so likely: where
     # none is able, the truth is as near to it as to the fit.
     partial: Mapping[str, float] | None = None
+    ended: bool = False  # by its budget, before all was tried
 
     def yield_to_another(self) -> Search:
         """Return the search where another cause explains the logs better, so that none is adopted."""
@@ -150,8 +160,9 @@ def search_hypotheses(
     first = _find_excess(minimum.problem, residuals, floors)
     if (first <= ASKS and not doubtful) or minimum.problem.predicts:
         return Search()
-    refits = _Search(fit, minimum, first, budget, progress).run()
-    return _judge(refits, first, measure_colour(fit.covariance, fit.white_covariance))
+    search = _Search(fit, minimum, first, budget, progress)
+    judged = _judge(search.run(), first, measure_colour(fit.covariance, fit.white_covariance))
+    return replace(judged, ended=search.ended)
 
 
 class _Search:
@@ -164,6 +175,7 @@ class _Search:
         # Which no refit tells from other values; but far from the logs sensitivities say little.
         self.silent = {effect.part for effect in fit.silent if first <= REMOVED}
         self.base = minimum.problem.evaluate(minimum.z)
+        self.ended = False
 
     def run(self) -> list[Refit]:
         """Return the refits of single hypotheses, and of pairs with the best of them where none suffices."""
@@ -193,7 +205,12 @@ class _Search:
         # Near noise likelihoods tell apart what hardly differs in excess.
         best = min(decided, key=lambda refit: refit.excess if self.first > ASKS else -refit.gain)
         settled = _settle(best, best.evaluation)
-        return _keep_best([*(refit for refit in refits if refit is not best), settled, *self.try_alone(settled)])
+        alone = list[Refit]()
+        if len(best.change.hypotheses) > 1 and settled.excess <= max(REMOVED, NEARLY * self.first):
+            alone += self.try_alone(settled)
+            if count_left() < 1.0:
+                self.ended, settled = True, replace(settled, undecided=True)
+        return _keep_best([*(refit for refit in refits if refit is not best), settled, *alone])
 
     def go_on(self, refit: Refit) -> Refit:
         """Return a refit that has helped and was left before its minimum after as many rounds again."""
@@ -205,7 +222,7 @@ class _Search:
 
     def try_alone(self, pair: Refit) -> Iterator[Refit]:
         """Yield each part of a pair alone, from the pair's values: one of them may explain as much."""
-        for hypothesis in pair.change.hypotheses if len(pair.change.hypotheses) > 1 else ():
+        for hypothesis in pair.change.hypotheses:
             change = change_plants(hypothesis, self.fit.experiments, self.fit.parameters, self.sizes)
             assert change is not None  # it is in a pair
             refit = _refit_alone(change, pair, self.helps, self.base, self.budget)
@@ -226,11 +243,12 @@ class _Search:
         for hypothesis in hypotheses:
             if hypothesis.part in self.silent or (before is not None and {*before.hypotheses, hypothesis} in done):
                 continue
-            if self.budget.left <= 0.0:
-                return
             change = change_plants(hypothesis, experiments, params, self.sizes, before)
             if change is None:
                 continue
+            if self.budget.left <= (0.0 if before is None else 2.0 * ROUND):  # a pair leaves what settles the best
+                self.ended = True
+                return
             self.progress(f"trying cause: {hypothesis.effect}", self.budget.share)
             refit = _refit(change, problem, fitted, self.helps, self.base, self.budget)
             if refit is not None:
@@ -364,7 +382,10 @@ def _weigh(change: Change, problem: FitProblem, evaluation: Evaluation, base: Ev
     excess, gain = _measure_excess(problem, evaluation.z), _measure_gain(base, evaluation)
     refit = Refit(change=change, problem=problem, evaluation=evaluation, excess=excess, gain=gain, evaluations=0)
     if excess <= REMOVED:
-        problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS)
+        try:
+            problem, evaluation = choose_first_steps(problem, evaluation, ROUGH_SUBSTEPS)
+        except BudgetError:
+            return refit
         if problem is not refit.problem:
             refit = _settle(replace(refit, problem=problem), evaluation)
     return refit

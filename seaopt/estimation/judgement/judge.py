@@ -27,8 +27,10 @@ from seaopt.estimation.judgement.score_test import Freed, ScoreTest, free_fixed,
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
 from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
-from seaopt.estimation.problem.noise_floor import measure_floors
-from seaopt.estimation.result.findings import FitFinding, OutputFit, find_energy, order_findings
+from seaopt.estimation.problem.fit_problem import limit_evaluations
+from seaopt.estimation.problem.noise_floor import NoiseFloor, measure_floors
+from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
+from seaopt.estimation.result.findings import FitFinding, OutputFit, find_ended_search, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.widening import widen
@@ -40,7 +42,8 @@ from seaopt.progress import Progress, divide, ignore
 from seaopt.units import unit_after
 
 OF_HYPOTHESES, OF_CAUSES = 3, 2  # times those, that refits of hypotheses and of other causes may take
-TESTS, CAUSES = 1.0, float(OF_HYPOTHESES + OF_CAUSES)  # times the search, that a judgement may take
+# Times the search, that a judgement may take: another start, and the search for causes.
+TESTS, CAUSES = 1.0, float(OF_HYPOTHESES + OF_CAUSES)
 HALF, MOST = 0.5, 0.8  # of what could be explained: an error below the one, a warning below the other
 WORSE = -1.0  # fit percent below which a constant explains more, beyond rounding and an offset that is fixed
 ALIKE = 0.95  # of an output's energy, that a multiple of the model explains where only sign or unit are wrong
@@ -78,11 +81,12 @@ def judge(
 
     `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
     not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's;
-    `evaluations`: what the fit took, of which the search for causes may take about five times as many, and five times
-    `EVALUATIONS` where it took fewer (see `budget`); `freed`: the minimum's problem with what was
-    fixed free, where that is at hand.
+    `evaluations`: what the fit took, of which the search for causes may take five times as many, and five times
+    `EVALUATIONS` where it took fewer (see `budget`), and another start once as many; `freed`: the minimum's problem
+    with what was fixed free, where that is at hand.
     """
     minimum = fit.require_minimum("judge")
+    evaluations = max(evaluations, EVALUATIONS)
     testing, trying = divide(progress, TESTS, CAUSES)
     testing("fitted; testing the residuals", 0.0)
     residuals = minimum.residuals()
@@ -95,11 +99,12 @@ def judge(
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
     floors = measure_floors(minimum.problem, residuals, minimum.z)
     error = estimate_model_error(minimum.problem, minimum.z, residuals, floors, noise.matrix)
-    excess = error.excess
-    fit = compare_logs(widen(_state_excess(fit, excess), error.matrix), validation)
+    fit = compare_logs(widen(_state_excess(fit, error.excess), error.matrix), validation)
     fit = replace(fit, silent=find_silent(fit))
+    with limit_evaluations(TESTS * evaluations):
+        another = list(find_other_minimum(fit))
     findings = [
-        *_find_unexplained(fit, shares, excess),
+        *_find_unexplained(fit, shares, error.excess),
         *_find_held_out(fit),
         *_find_at_bound(fit, minimum),
         *_find_implausible(fit),
@@ -109,27 +114,52 @@ def judge(
         *find_excesses(fit),
         *find_rough(fit, error),
         *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each))), minimum),
-        *find_other_minimum(fit),
+        *another,
     ]
     suspects = {name: test for name, test in _run_tests(fit, minimum, freed).items() if test.p < DOUBTFUL}
+    budget = Budget.begin((OF_HYPOTHESES + OF_CAUSES) * evaluations, minimum.problem.count_work(minimum.z))
+    with budget.enforce():
+        fit, findings, search = _search_causes(
+            fit, findings, residuals, floors, error, suspects, alternatives, budget, evaluations, trying
+        )
+    findings += find_step_error(fit)  # at last, for no cause explains it
+    return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))
+
+
+def _search_causes(
+    fit: Fit,
+    findings: list[FitFinding],
+    residuals: ResidualsByExperiment,
+    floors: Mapping[str, NoiseFloor],
+    error: ModelError,
+    suspects: Mapping[str, ScoreTest],
+    alternatives: Sequence[Plant],
+    budget: Budget,
+    evaluations: int,
+    progress: Progress,
+) -> tuple[Fit, list[FitFinding], Search]:
+    """Return the fit with intervals that reach to what explains it as well, its findings with the causes that are
+    named, and what became of each hypothesis. `findings`: those yet; `evaluations`: those of a share of the budget.
+    """
     noticed = (
-        any(ratio > FAR for ratio in excess.values())  # noise of a colour is so, too
+        any(ratio > FAR for ratio in error.excess.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)
         or fit.status != "converged"
     )
-    wrong = noticed or bool(suspects)
     little = any(finding.kind == "explained" for finding in findings)
-    refitting = divide(trying, OF_HYPOTHESES, OF_CAUSES)[0]
-    unit = minimum.problem.count_work(minimum.z)
-    evaluations = max(evaluations, EVALUATIONS)
-    looking = Budget.begin(OF_HYPOTHESES * evaluations, unit)
     doubtful = _hangs_on_little(fit, findings)
-    search = Search() if little else search_hypotheses(fit, residuals, floors, looking, refitting, doubtful=doubtful)
+    looking = budget.part(OF_HYPOTHESES * evaluations)
+    search = Search()
+    if not little:
+        # What settles them may take more than their share, and leaves the other causes one.
+        with budget.enforce(leaving=evaluations):
+            refitting = divide(progress, OF_HYPOTHESES, OF_CAUSES)[0]
+            search = search_hypotheses(fit, residuals, floors, looking, refitting, doubtful=doubtful)
+    ended = search.ended
     if search.partial is not None:
         fit, findings = _reach(fit, findings, error, search.partial)
-    if wrong or search.able:
-        # A search of hypotheses that takes more than its share leaves the other causes theirs.
-        budget = Budget.begin(OF_CAUSES * evaluations + max(looking.left, 0.0), unit)
+    if noticed or suspects or search.able:
+        trying = budget.part(OF_CAUSES * evaluations + max(looking.left, 0.0))
         causes = find_causes(
             fit,
             residuals,
@@ -138,9 +168,10 @@ def judge(
             poor=little or fit.status == "not_identifiable",
             noticed=noticed,
             hypotheses=search.able,
-            budget=budget,
-            progress=divide(trying, looking.spent, budget.evaluations)[1],
+            budget=trying,
+            progress=divide(progress, looking.spent, trying.evaluations)[1],
         )
+        ended = ended or trying.left <= 0.0
         named = list(_name_causes(fit, causes, suspects))
         told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)
         rivals = _list_rivals(causes)
@@ -152,8 +183,7 @@ def judge(
             named = [replace(each, severity="warning") if each.kind == "cause" else each for each in named]
         findings += named
         search = search if not causes or causes[0].refit is not None else search.yield_to_another()
-    findings += find_step_error(fit)  # at last, for no cause explains it
-    return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))
+    return fit, [*findings, *([find_ended_search(budget.evaluations)] if ended else [])], search
 
 
 def _hangs_on_little(fit: Fit, findings: Sequence[FitFinding]) -> bool:

@@ -22,7 +22,8 @@ where noise is hardly there it is the true second derivative.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -54,6 +55,11 @@ ALONE = 8_000  # samples below which experiments are not worth a thread each
 T = TypeVar("T")
 _evaluations: ContextVar[int] = ContextVar("evaluations", default=0)
 _work: ContextVar[int] = ContextVar("work", default=0)
+_most: ContextVar[float] = ContextVar("most", default=np.inf)
+
+
+class BudgetError(EstimationError):
+    """As many evaluations were made as a search may make (`limit_evaluations`)."""
 
 
 @record(eq=False)
@@ -150,6 +156,8 @@ class FitProblem:
 
     def evaluate(self, z: Vector) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""
+        if count_left() < 1.0:
+            raise BudgetError("no evaluation is left of those that this search may make")
         _evaluations.set(_evaluations.get() + 1)
         _work.set(_work.get() + self.count_work(z))
         passes = self.map(lambda experiment: (experiment.name, experiment.run_all(z)))
@@ -260,6 +268,21 @@ class FitProblem:
 def count_evaluations() -> int:
     """Return how often problems have been evaluated here, which is what searches are counted in, not in seconds."""
     return _evaluations.get()
+
+
+def count_left() -> float:
+    """Return how many evaluations may still be made here: see `limit_evaluations`."""
+    return _most.get() - _evaluations.get()
+
+
+@contextmanager
+def limit_evaluations(count: float) -> Iterator[None]:
+    """Refuse evaluations inside after so many, with `BudgetError`; a limit around it holds, too."""
+    token = _most.set(min(_most.get(), _evaluations.get() + count))
+    try:
+        yield
+    finally:
+        _most.reset(token)
 
 
 def count_work() -> int:

@@ -32,8 +32,8 @@ class FitFinding:
     )
 
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
-    # for programs: "bound", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out", "noise",
-    # "range", "residual", "rough", "samples", "sharp", "starts", "step", "unjudged"
+    # for programs: "bound", "budget", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out",
+    # "noise", "range", "residual", "rough", "samples", "sharp", "starts", "step", "unjudged"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy
@@ -114,6 +114,17 @@ def find_unjudged() -> FitFinding:
         kind="unjudged",
         where="",
         text="it is not judged: what it leaves was still looked into as it was written; let the fit run to its end",
+    )
+
+
+def find_ended_search(evaluations: float) -> FitFinding:
+    """Return a note that the search for causes has made all evaluations that it may, before all causes were tried."""
+    return FitFinding(
+        severity="note",
+        kind="budget",
+        where="",
+        text=f"the search for causes was ended by its budget of {evaluations:.0f} evaluations: causes that are not "
+        "named, and pairs of them, may not have been tried; mend what is named, and fit again",
     )
 
 

@@ -1,14 +1,17 @@
 """What a judgement may spend on refits, counted so that the same log has the same answer on any machine.
 
-It is counted in evaluations. An evaluation takes its integration steps, and about as long as one for the residual of
-each sample and its sums; one that takes many times what the fit's last one took counts for more. Where each counted for
-what it takes, the search would end before it came to bristles that are the cause: they need three to nine times the
-fit's, and two of six such actuators were not explained.
+It is counted in evaluations, of which no more are made than the whole allows (`Budget.enforce`): a search that comes to
+its end keeps what it has. Parts of the whole are asked before a refit begins. In them an evaluation takes its
+integration steps, and about as long as one for the residual of each sample and its sums; one that takes many times what
+the fit's last one took counts for more. Where each counted for what it takes, the search would end before it came to
+bristles that are the cause: they need three to nine times the fit's, and two of six such actuators were not explained.
 """
 
 from __future__ import annotations
 
-from seaopt.estimation.problem.fit_problem import FitProblem, count_evaluations, count_work
+from contextlib import AbstractContextManager
+
+from seaopt.estimation.problem.fit_problem import FitProblem, count_evaluations, count_work, limit_evaluations
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.records import record
 
@@ -33,11 +36,23 @@ class Budget:
         """Return a budget from here on."""
         return cls(evaluations=evaluations, unit=unit, evaluations_before=count_evaluations(), work_before=count_work())
 
+    def part(self, evaluations: float) -> Budget:
+        """Return a budget from here on that is a part of this one: of at most so many, or all that may be made."""
+        return Budget.begin(min(evaluations, self.evaluations - self.made), self.unit)
+
+    def enforce(self, leaving: float = 0.0) -> AbstractContextManager[None]:
+        """Refuse evaluations inside beyond this budget, and the last `leaving` of it."""
+        return limit_evaluations(self.evaluations - self.made - leaving)
+
+    @property
+    def made(self) -> int:
+        """Evaluations that were made."""
+        return count_evaluations() - self.evaluations_before
+
     @property
     def spent(self) -> float:
         """Evaluations that were made, or what they took where that is more."""
-        work = (count_work() - self.work_before) / (FINE * self.unit)
-        return max(count_evaluations() - self.evaluations_before, work)
+        return max(self.made, (count_work() - self.work_before) / (FINE * self.unit))
 
     @property
     def left(self) -> float:

@@ -21,6 +21,7 @@ from typing import Generic, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool
 
+from seaopt.estimation.problem.fit_problem import BudgetError
 from seaopt.estimation.problem.normal_equations import M, QuadraticModel, find_arrow, solve_seen
 from seaopt.estimation.problem.shapes import Matrix, Vector
 from seaopt.records import record
@@ -159,7 +160,10 @@ def minimise(
                     message=f"the minimum is within {distance / np.sqrt(before):.1g} standard deviations",
                 )
         predicted = -float(current.gradient @ moved + 0.5 * moved @ current.hessian @ moved)
-        trial = objective.evaluate(end)
+        try:
+            trial = objective.evaluate(end)
+        except BudgetError:
+            break
         ratio = (current.cost - trial.cost) / predicted if predicted > 0.0 and np.isfinite(trial.cost) else -1.0
         lost += not np.isfinite(trial.cost)
         if trial.cost < best - max(GAIN * 0.5 * distance, NEAR_ENOUGH):
