@@ -99,7 +99,7 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "`derate`": {"CONTROLLER": "derate = true", "PARTS": 'parts = ["thermal"]'},
     "`frf:` in `robust_to`": {"ROBUST_TO": '"frf:chirp"', "EXPERIMENT": EXPERIMENT},
     "plants to certify on": {"CERTIFIED": '"swing"'},
-    "`retune`": {"ROBUSTNESS": "retune = 2"},
+    "`retune`": {"ROBUSTNESS": "retune = 2", "CERTIFIED": '"swing"'},
     "`seaopt tune --sweep`": {},
 }
 DEFAULTS = {"PLANT": "stand", "MEASURED": '"tau_s"', "ROBUST_TO": "", "CERTIFIED": '"stand"', "COULOMB": "0", "ROBUSTNESS": "retune = 0"}

@@ -426,7 +426,7 @@ class Session:
         source, design = self.parameters(), self.problem.design_plant
         self.warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
         self._spec()
-        options = {"free_law": self.free_law, "executor": self.executor, "progress": tell}
+        options: dict[str, Any] = {"free_law": self.free_law, "executor": self.executor, "progress": tell}
         result, plans = sweep_problem(self.problem, source, self.bandwidths_hz, **options)
         content, self.results["sweep"] = result.to_dict(), result
         for law, plan in zip(content["controllers"], plans, strict=False):  # of predictive control each with its plan

@@ -228,14 +228,14 @@ def tune_problem(
         if rounds == 0 or not _needs_reserve(problem, tuned, source):
             return tuned
         rounds = ROUNDS
-    if problem.designs_on_response:
+    if problem.designs_on_response and not problem.certified_plants():
         raise ProblemError(
             f"{problem.source}: retune = {rounds} in [robustness] tunes again at worst draws, and of "
-            f"{problem.response_names[0]}, a measured response, nothing is drawn; leave retune out, or name a plant "
-            "there and the response in robust_to"
+            f"{problem.response_names[0]}, a measured response, nothing is drawn; leave retune out, or name models in "
+            "plants of [robustness]"
         )
     return tune_certified(
-        problem.design_plant,
+        design,
         source,
         spec,
         problem.certified_plants(),
@@ -409,9 +409,7 @@ def certify_problem(
     if isinstance(controller, Controller) and problem.designs_on_response:
         if not plants:
             return certify(controller, plants, source, seed=table.seed, measured=measured)
-        controller = replace(
-            controller, design=(problem.design_plant, problem.values(source)), designed_on_response=True
-        )
+        controller = controller.with_model
     law = controller.controllers[0] if isinstance(controller, ScheduledController) else controller
     read = list_readings(law, plants)
     certificate = certify(

@@ -181,6 +181,30 @@ def test_what_no_response_tells_is_of_the_model_of_what_was_measured(tmp_path):
     assert certificate.simulated.verification.rows
 
 
+def test_a_design_on_a_response_is_tuned_again_at_draws_of_the_models_it_is_certified_on(write):
+    path = write("frf:chirp", "")
+    kept = (
+        FILE.replace("PLANT", "frf:chirp")
+        .replace("OTHERS", "")
+        .replace("max_sensitivity = 1.7", "max_sensitivity = 1.5")
+    )
+    drawn = 'samples = 50\nretune = 4\nplants = ["stand"]\nparameters = { k = [5e5, 8e5], eta = [0.9, 1.1] }'
+    path.write_text(kept.replace("samples = 50", drawn))
+    problem = so.read_problem(path)
+    done = tune_problem(problem, problem.parameters)
+    assert done.met and len(done.rounds) == 2, done
+    assert done.controller.design is None and set(done.certificate.plants) == {"stand"}
+    stand = problem.plants["stand"]
+    for k in (5e5, 8e5):
+        for eta in (0.9, 1.1):
+            loop = done.controller.close(stand, stand.defaults.update(k=k, eta=eta))
+            assert np.max(np.abs(loop.eigenvalues())) < 1.0 and loop.figures().ms < 1.5 * 1.001
+    path.write_text(kept.replace("samples = 50", "samples = 50\nretune = 2"))
+    problem = so.read_problem(path)
+    with pytest.raises(ProblemError, match=r"name models in plants of \[robustness\]"):
+        tune_problem(problem, problem.parameters)
+
+
 def test_what_feeds_the_motor_back_is_refused_where_the_loop_is_measured(tmp_path):
     path = tmp_path / "knee.toml"
     path.write_text(WARM.replace("fraction = 0.4", 'fraction = 0.4, from = "speed"'))

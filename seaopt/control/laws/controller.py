@@ -280,6 +280,13 @@ class Controller(ClosesLoops, Result, Worded):
         return self.design is None or self.designed_on_response
 
     @property
+    def with_model(self) -> Controller:
+        """The same with the model of what was measured as its design plant, where that is a measured response."""
+        if self.design is not None or self.measured_on is None:
+            return self
+        return replace(self, design=self.measured_on, designed_on_response=True)
+
+    @property
     def judged_on(self) -> str:
         """The plant of `achieved`: the design plant, or the worst in a measured response's discs."""
         return "worst measured" if self.design is None and self.measured else "design plant"

@@ -181,7 +181,7 @@ class Judge:
         return str(self.faults[0]) if self.faults else ""
 
 
-def take_ends(signal: Signal, ends: Sequence[int], length: int) -> Float[np.ndarray, "k n"]:
+def take_ends(signal: Signal, ends: Sequence[int], length: int) -> Float[np.ndarray, "ends length"]:
     """Return the last samples of the phases of a run that end there, of which is judged what has settled."""
     return np.array([signal[end - length : end] for end in ends])
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from seaopt.control import Controller, ControllerSpec, ScheduledController, tune, tune_schedule
 from seaopt.control.laws.delay import settle_delays
+from seaopt.control.tuning.tuner import name_design
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import format_count, format_table, format_values, html_text
@@ -142,7 +143,7 @@ class JointTuning(Result):
 
 
 def tune_certified(
-    plant: Plant,
+    plant: Plant | MeasuredResponse,
     parameters: Source,
     spec: ControllerSpec,
     plants: Plants,
@@ -167,8 +168,8 @@ def tune_certified(
 
     Parameters
     ----------
-    plant : Plant
-        The design plant.
+    plant : Plant or MeasuredResponse
+        The design plant; of a response nothing is drawn but on `plants`, which are models.
     parameters : Fit or ParameterSet
         A fit, or values with the prior_std of those that have one.
     spec : ControllerSpec
@@ -218,7 +219,7 @@ def tune_certified(
     require_type(plants, Mapping, "plants", "give a mapping of name to plant", ControlError)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     check_numbers(rounds=rounds, confidence=confidence)
-    spec, settled = settle_delays(spec, plant, parameters)
+    spec, settled = settle_delays(spec, name_design(plant), parameters)
     fitted = settled.parameters if isinstance(settled, Fit) else settled
     values = (others or ParameterSet()).with_parameters(*fitted.values())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
@@ -227,7 +228,7 @@ def tune_certified(
 
     def tune_at(bandwidth_hz: float) -> Controller:
         law = tune(plant, values, replace(asked, bandwidth_hz=bandwidth_hz), robust_to, draws=draws, outer=outer)
-        return law if complete is None else complete(law)
+        return (law if complete is None else complete(law)).with_model
 
     drawn = {"parameters": parameters, "ranges": ranges or {}, "others": others or ParameterSet()}
     look = partial(look_at_draws, plants=plants, **drawn)
@@ -237,15 +238,15 @@ def tune_certified(
         tuning, certifying = divide(prefix(part, f"round {number}"), TUNING, CERTIFYING)
         options: dict[str, Any] = {"robust_to": witnesses, "draws": draws, "outer": outer, "progress": tuning}
         controller: Controller | ScheduledController
-        if over is None:
+        if over is None or isinstance(plant, MeasuredResponse):
             controller = tune(plant, values, spec, **options)
         else:
             controller = tune_schedule(plant, values, spec, over, points, bandwidths_hz=bandwidths_hz, **options)
         controller = controller if complete is None else complete(controller)
-        certificate = None
+        certificate, certified = None, controller.with_model if isinstance(controller, Controller) else controller
         if controller.met:
             certificate = certify(
-                controller,
+                certified,
                 plants,
                 parameters,
                 ranges=ranges,
@@ -259,13 +260,14 @@ def tune_certified(
                 progress=certifying,
             )
         pairs = [pair for pair in witnesses.values() if not isinstance(pair, MeasuredResponse)]
-        added = _list_new_witnesses(certificate, [(plant, values), *pairs], number)
+        designs = [] if isinstance(plant, MeasuredResponse) else [(plant, values)]
+        added = _list_new_witnesses(certificate, [*designs, *pairs], number)
         plants_met = 1 + len(witnesses)
         made: dict[str, Any] = {"controller": controller, "certificate": certificate}
         over_limits = [] if certificate is None or certificate.passed else _list_over(certificate)
         raised = raise_reserve(spec, over_limits)
-        if strained is None and isinstance(controller, Controller) and any(each.needed for each in over_limits):
-            strained = controller if certificate is not None and certificate.varied else None
+        if strained is None and isinstance(certified, Controller) and any(each.needed for each in over_limits):
+            strained = certified if certificate is not None and certificate.varied else None
         finished.append(Round(number=number, plants=plants_met, added=(*added,), **made))
         if certificate is None:
             status = "infeasible"
