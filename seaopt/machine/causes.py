@@ -8,7 +8,7 @@ where one removes much and leaves something, a second is looked for behind it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control import Controller, ForceMPC, RunnableSchedule, runnable
-from seaopt.control.laws.structures import LAW_GAINS, Gains
+from seaopt.control.laws.structures import Gains
 from seaopt.errors import SeaoptError
+from seaopt.machine.free_gains import find_same, fit_gains, make_law, read_gains
 from seaopt.machine.stepped import Match, Setting, count_head, find_limited, find_modes, follow, limit_law, play
 from seaopt.machine.ticks import Ticks
 from seaopt.records import record
@@ -28,6 +29,7 @@ EVERY = (2, 3, 4, 5, 10)  # rows per tick of a law that is slower than the logge
 UNITS = tuple(each**power for each in (1e3, 60.0 / (2.0 * math.pi), 180.0 / math.pi, 1e6, 1e2) for power in (-1, 1))
 SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
 MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
+LESS = 0.1  # of what a single cause leaves: another set of gains, which has more to fit, leaves less
 MOST_CAUSES = 6
 SHORT = {"gain": "short, gain", "factor": "short, factor", "late": "short, late"}  # more periods would tell these
 ROWS = (
@@ -52,6 +54,9 @@ class Cause:
     unit: str
     removes: float  # share of the mismatch's energy
     explains: bool  # leaves nothing but rounding
+    gains: Mapping[str, float] | None = None  # of a law with another set of them, as fitted
+    exported: Mapping[str, float] | None = None  # those of this law
+    besides: bool = False  # it is so beside the first cause, and removes what it does together with that
 
     @property
     def undecided(self) -> bool:
@@ -74,6 +79,8 @@ class Alternative:
     change: Callable[[Setting], Setting]
     value: float | None = None
     unit: str = ""
+    gains: Mapping[str, float] | None = None
+    exported: Mapping[str, float] | None = None
 
 
 def find_causes(whole: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[tuple[Cause, ...], Setting]:
@@ -90,15 +97,57 @@ def find_causes(whole: Setting, match: Match, others: Mapping[str, Controller]) 
     tried = sorted(_try_all(window, others), key=_rank)
     if not tried or tried[0][1].energy >= before:
         return (), whole
-    causes = [_make_cause(alternative, played, before) for alternative, played in tried[:MOST_CAUSES]]
-    best = tried[0][0]
-    if not causes[0].explains and causes[0].removes > MUCH:
-        behind = best.change(window)
-        second = min(_try_all(behind, {}), key=lambda pair: pair[1].energy, default=None)
+    causes = [_make_cause(*pair, before) for pair in tried[:MOST_CAUSES]]
+    best, second = tried[0], None
+    if not causes[0].explains:
+        best, second = _look_further(whole, window, tried, others, causes[0].removes > MUCH)
+    if best is not tried[0]:
+        causes = [_make_cause(*best, before), *(cause for cause in causes if cause.kind != best[0].kind)]
+    if second is not None:
+        causes = [causes[0], replace(_make_cause(*second, before), besides=True), *causes[1:]]
+    return tuple(cause for cause in causes if cause.removes > 0.0 or cause.besides), best[0].change(whole)
+
+
+Tried = tuple[Alternative, Match]
+
+
+def _look_further(
+    whole: Setting, window: Setting, tried: Sequence[Tried], others: Mapping[str, Controller], much: bool
+) -> tuple[Tried, Tried | None]:
+    """Return what explains more than single causes do: a second one behind the best, which removes `much`, or another
+    set of gains, by itself or behind a limit.
+    """
+    best, energy = tried[0], tried[0][1].energy
+    if much:
+        second = min(_try_all(best[0].change(window), {}), key=lambda pair: pair[1].energy, default=None)
         if second is not None and second[1].met:
-            cause = _make_cause(second[0], second[1], before)
-            causes = [causes[0], cause, *causes[1:]]
-    return tuple(cause for cause in causes if cause.removes > 0.0), best.change(whole)
+            return best, second
+    if (gains := _try_gains(whole, window, energy, others)) is not None:
+        return gains, None
+    rivals = list[tuple[Tried, Tried]]()
+    for first in [pair for pair in tried if pair[0].kind == "limit"]:
+        change = first[0].change
+        if (gains := _try_gains(change(whole), change(window), energy, others)) is not None:
+            rivals.append((first, gains))
+    return min(rivals, key=lambda pair: _rank(pair[1]), default=(best, None))
+
+
+def _try_gains(whole: Setting, window: Setting, energy: float, others: Mapping[str, Controller]) -> Tried | None:
+    """Return the law with another set of gains, all fitted at once, and its match, where it leaves much less of the
+    mismatch than any single cause.
+    """
+    own, gains = read_gains(whole.controller), fit_gains(whole)
+    if own is None or gains is None:
+        return None
+    alternative = Alternative(
+        kind="gains",
+        what=find_same(gains, others) or "law",
+        change=make_law(whole.controller, gains),
+        gains=gains.by_name(),
+        exported=own.by_name(),
+    )
+    played = next(_play_each(window, [alternative]), None)
+    return played if played is not None and (played[1].met or played[1].energy < LESS * energy) else None
 
 
 def _rank(pair: tuple[Alternative, Match]) -> tuple[bool, bool, float]:
@@ -115,11 +164,17 @@ def _make_cause(alternative: Alternative, played: Match, before: float) -> Cause
         unit=alternative.unit,
         removes=1.0 - played.energy / before,
         explains=played.met,
+        gains=alternative.gains,
+        exported=alternative.exported,
     )
 
 
 def _try_all(setting: Setting, others: Mapping[str, Controller]) -> Iterator[tuple[Alternative, Match]]:
-    for alternative in list_alternatives(setting, others):
+    return _play_each(setting, list_alternatives(setting, others))
+
+
+def _play_each(setting: Setting, alternatives: Iterable[Alternative]) -> Iterator[tuple[Alternative, Match]]:
+    for alternative in alternatives:
         try:
             played = play(alternative.change(setting))
         except SeaoptError:  # a law that cannot run so
@@ -260,13 +315,15 @@ def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
     if np.any(find_limited(ticks)) and not math.isclose(reached, law.command_limit, rel_tol=1e-3):
         change = lambda given: replace(given, law=limit_law(given.law, reached))  # noqa: E731
         yield Alternative(kind="limit", what="command", value=reached, unit=unit, change=change)
+        if not isinstance(law, ForceMPC):
+            untold = lambda given: _leave_windup(change(given))  # noqa: E731
+            yield Alternative(kind="limit", what="behind the law", value=reached, unit=unit, change=untold)
     if law.gate is not None:
         yield Alternative(kind="gate", what="left out", change=_change_law(gate=None))
     if law.heat is not None:
         yield Alternative(kind="heat", what="left out", change=_change_law(heat=None))
     if not isinstance(law, ForceMPC) and np.any(law.anti_windup):
-        none = np.zeros_like(law.anti_windup)
-        yield Alternative(kind="anti-windup", what="left out", change=_change_law(anti_windup=none))
+        yield Alternative(kind="anti-windup", what="left out", change=_leave_windup)
     added = linear.compensation
     terms = [] if added is None else [name for name in ("friction", "gravity", "ripple") if getattr(added, name)]
     for name in terms:
@@ -279,15 +336,13 @@ def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
         yield Alternative(kind="feedforward", what="link", change=change)
 
 
+def _leave_windup(setting: Setting) -> Setting:
+    assert not isinstance(setting.law, ForceMPC)
+    return _change_law(anti_windup=np.zeros_like(setting.law.anti_windup))(setting)
+
+
 def _all_but_last(n: int) -> Float[np.ndarray, " n"]:
     return np.append(np.ones(n - 1), 0.0)
-
-
-def read_gains(controller: Controller) -> Gains | None:
-    """Return the gains that make a controller's law; None of a law of the user's own."""
-    if not set(LAW_GAINS) <= set(controller.gains):
-        return None
-    return Gains.from_names(controller.gains, controller.observer, controller.speed_loop, controller.link)
 
 
 def _list_places(setting: Setting) -> Iterator[Alternative]:
@@ -310,33 +365,20 @@ def _scale_place(ticks: Ticks, factor: float) -> Ticks:
     return replace(ticks, place=None if ticks.place is None else factor * ticks.place)
 
 
-def _make_law(controller: Controller, gains: Gains, sample_time_s: float | None = None) -> Callable[[Setting], Setting]:
-    """Return what gives a setting the law of other gains, or of another sample time, with the guards that it has."""
-
-    def change(setting: Setting) -> Setting:
-        period = sample_time_s or controller.sample_time_s
-        law = gains.law(controller.spec.structure, period).balanced()
-        made = runnable(replace(controller, law=law))
-        guards = {name: getattr(setting.linear, name) for name in ("gate", "heat", "compensation", "command_limit")}
-        return replace(setting, law=replace(made, **guards))
-
-    return change
-
-
 def _list_of_gains(setting: Setting) -> Iterator[Alternative]:
     """Yield laws with parts that are left out, with gains of another size, and made for another rate."""
     controller, gains = setting.controller, read_gains(setting.controller)
     if gains is None:
         return
     for kind, what, value, part in list_parts(gains):
-        yield Alternative(kind=kind, what=what, value=value, change=_make_law(controller, part))
+        yield Alternative(kind=kind, what=what, value=value, change=make_law(controller, part))
     for name, value in _fit_gains(setting, gains).items():
-        change = _make_law(controller, replace(gains, **{name: value}))
+        change = make_law(controller, replace(gains, **{name: value}))
         yield Alternative(kind="gain", what=name, value=value, change=change)
     rates = {2.0 * controller.sample_time_s, 0.5 * controller.sample_time_s, 1.0 / setting.ticks.rate_hz}
     for period in rates:
         if not math.isclose(period, controller.sample_time_s, rel_tol=1e-3):
-            change = _make_law(controller, gains, period)
+            change = make_law(controller, gains, period)
             yield Alternative(kind="rate", what="gains", value=1.0 / period, unit="Hz", change=change)
 
 
@@ -373,7 +415,7 @@ def _fit_gains(setting: Setting, gains: Gains) -> dict[str, float]:
         value = getattr(gains, name)
         if not value:
             continue
-        changed = _make_law(setting.controller, replace(gains, **{name: 1.01 * value}))(setting)
+        changed = make_law(setting.controller, replace(gains, **{name: 1.01 * value}))(setting)
         column = (follow(changed.linear, ticks, limited) - base) / (0.01 * value)
         table = np.column_stack([column, modes])
         step = np.linalg.lstsq(table[free], (ticks.command - base)[free], rcond=1e-10)[0][0]

@@ -36,7 +36,8 @@ from seaopt.control.laws.structures import Gains
 from seaopt.control.loops.law import Law
 from seaopt.errors import LogError
 from seaopt.logs.quality.faults import find_quantisation
-from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_parts, name_factor, read_gains
+from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_parts, name_factor
+from seaopt.machine.free_gains import read_gains
 from seaopt.machine.response.periods import Blocks, cut_periods
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
 from seaopt.machine.stepped import SAME_PLACE, Setting

@@ -9,10 +9,11 @@ from pathlib import Path
 from seaopt.control import Controller
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import EXPLAINED, Acceptance
-from seaopt.machine.causes import Cause, read_gains
+from seaopt.machine.causes import Cause
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.figures import list_panels
+from seaopt.machine.free_gains import SAME_GAINS, read_gains
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, SHORT_BY, Judged, Measured, Response
@@ -104,6 +105,7 @@ TWO_AMPLITUDES = (
 IN_PART = (
     "No row explains all of it. An interval holds where nothing but its row differs; the true size may be outside."
 )
+AND = "with the first one also: "
 UNTOLD = {
     "short, gain": "a law whose {} is half as large",
     "short, factor": "a {} that is halved",
@@ -154,6 +156,8 @@ def say_cause(cause: Cause) -> str:
             return f"{cause.what} is {value} times what it should be"
         case "gain":
             return f"the gain {cause.what} is {value}"
+        case "limit" if cause.what == "behind the law":
+            return f"the command is limited to {value}{unit_after(cause.unit)} behind the law, which is not told of it"
         case "limit":
             return f"the command is limited to {value}{unit_after(cause.unit)}"
         case "feedforward":
@@ -164,10 +168,22 @@ def say_cause(cause: Cause) -> str:
             return f"the compensation of {cause.what} is missing"
         case "part":
             return f"the {cause.what} is missing"
+        case "gains":
+            return _say_gains(cause)
         case "another law":
             return f"it is the law of {cause.what}"
         case _:
             return f"the {cause.kind} is {cause.what}"
+
+
+def _say_gains(cause: Cause) -> str:
+    """Return which gains a law has that are not the exported ones, the most different first."""
+    found, exported = cause.gains or {}, cause.exported or {}
+    apart = {name: abs(found[name] - value) / max(abs(found[name]), abs(value)) for name, value in exported.items()}
+    named = [name for name in sorted(apart, key=lambda name: -apart[name]) if apart[name] > SAME_GAINS]
+    values = [f"{name} {format_number(found[name])} ({format_number(exported[name])} exported)" for name in named]
+    whose = "" if cause.what == "law" else f", those of {cause.what}"
+    return f"it is a law with another set of gains{whose}: {', '.join(values)}"
 
 
 def say_difference(each: Difference) -> str:
@@ -308,6 +324,8 @@ def _say_mismatch(row: Replay, result: Acceptance) -> str:
         off = f"{off}, or lines of the reference lie above half of the log's rate"
     if not row.causes:
         return f"{off}; {MISSED}"
+    if len(row.causes) > 1 and row.causes[1].besides and row.causes[1].explains:
+        return f"{say_cause(row.causes[0])}, and {say_cause(row.causes[1])}"
     return f"{off}; nearest: {say_cause(row.causes[0])} ({100.0 * row.causes[0].removes:.0f} % of it)"
 
 
@@ -486,7 +504,11 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     ]
     for source, row in zip(result.sources, result.replays, strict=True):
         table = tuple(
-            (say_cause(cause), f"{100.0 * cause.removes:.4g} %", mark_met(cause.explains, "all", "in part"))
+            (
+                AND * cause.besides + say_cause(cause),
+                f"{100.0 * cause.removes:.4g} %",
+                mark_met(cause.explains, "all", "in part"),
+            )
             for cause in row.causes[: 0 if row.undecided else MOST_CAUSES]
         )
         if table:

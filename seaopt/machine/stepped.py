@@ -259,7 +259,7 @@ def count_head(law: RunnableLaw) -> int:
     return int(min(max(HEAD, HEAD_DECAYS * slowest), LONGEST_HEAD))
 
 
-def _drive(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
+def drive_law(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
     """Return what reference and readings add to the effort at once, and to the next state, at each row."""
     columns, direct = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
     reference, added = _compensate(law, ticks)
@@ -291,12 +291,12 @@ def find_modes(law: RunnableLaw, limited: Bool[np.ndarray, " n"]) -> Float[np.nd
     stretches = np.split(np.arange(limited.size), np.flatnonzero(np.diff(limited)) + 1) if limited.size else []
     for part in stretches:
         way = ways[int(limited[part[0]])]
-        rows[part] = _list_powers(law.c, way, part.size) @ moved
+        rows[part] = list_powers(law.c, way, part.size) @ moved
         moved = np.linalg.matrix_power(way, part.size) @ moved
     return law.per_effort * rows
 
 
-def _list_powers(row: Float[np.ndarray, " m"], way: Float[np.ndarray, "m m"], count: int) -> Float[np.ndarray, "n m"]:
+def list_powers(row: Float[np.ndarray, " m"], way: Float[np.ndarray, "m m"], count: int) -> Float[np.ndarray, "n m"]:
     """Return a row times each power of a matrix, twice as many at each step."""
     rows = row[None]
     while len(rows) < count:
@@ -310,7 +310,7 @@ def follow(
     """Return the commands, not limited, of a law that starts from zero and whose limit acts in the rows where it does
     in the log; with a share of the limit. That is linear in reference, readings and share.
     """
-    direct, drive = _drive(law, ticks)
+    direct, drive = drive_law(law, ticks)
     x, out, most = np.zeros(law.c.size), np.empty(len(ticks)), share * law.force_limit_N
     signs, at_limit = np.sign(ticks.command), limited.tolist()
     for k in range(len(ticks)):

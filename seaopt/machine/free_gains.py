@@ -1,0 +1,199 @@
+r"""The gains of a law whose command is logged: all of them fitted to it at once.
+
+At given time constants :math:`\tau` (of filters, observer, notch, prefilter) a law's commands are affine in its gains
+:math:`\theta` and linear in its state at the first row (`seaopt.control.laws.structures`), while no limit is active:
+
+.. math:: u = u_0(\tau) + \Phi(\tau)\,\theta + M(\tau)\,x_0 .
+
+Least squares of the logged commands over :math:`\theta` and :math:`x_0` leaves a residual that depends on
+:math:`\tau` alone, which a search in their logarithms makes smallest (variable projection; Golub, Pereyra, Inverse
+Problems 19, 2003). It takes runs of rows none of which is at the limit, each with a state of its own. Command and
+readings of a law without noise of its own determine it to their rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.control import Controller, RunnableLaw, runnable
+from seaopt.control.laws.structures import LAW_GAINS, Gains
+from seaopt.errors import SeaoptError
+from seaopt.machine.stepped import FLOOR, Setting, drive_law, find_limited, list_powers
+from seaopt.machine.ticks import AT_LIMIT, Ticks
+from seaopt.records import record
+
+FEWEST, MOST = 400, 4000  # rows without a limit that it takes in all
+RUNS = 8  # of them one after another, each from a state of its own
+SHORTEST, PER_STATE = 40, 8  # rows of one, and per state
+STARTS = (1.0, 0.3, 3.0)  # times the law's own time constants
+REACH = 30.0  # times them, up and down
+SMALL = 1e-3  # of a gain's natural size, where the law has none of it: its term is there all the same
+STEP = 1e-6  # of a logarithm, by which the search differentiates
+SAME_GAINS = 0.01  # relative: gains that are those of another law
+
+
+def read_gains(controller: Controller) -> Gains | None:
+    """Return the gains that make a controller's law; None of a law of the user's own."""
+    if not set(LAW_GAINS) <= set(controller.gains):
+        return None
+    return Gains.from_names(controller.gains, controller.observer, controller.speed_loop, controller.link)
+
+
+def make_law(controller: Controller, gains: Gains, sample_time_s: float | None = None) -> Callable[[Setting], Setting]:
+    """Return what gives a setting the law of other gains, or of another sample time, with the guards that it has."""
+
+    def change(setting: Setting) -> Setting:
+        period = sample_time_s or controller.sample_time_s
+        law = gains.law(controller.spec.structure, period).balanced()
+        made = runnable(replace(controller, law=law))
+        guards: dict[str, Any] = {
+            name: getattr(setting.linear, name) for name in ("gate", "heat", "compensation", "command_limit")
+        }
+        if not np.any(setting.linear.anti_windup):
+            guards["anti_windup"] = np.zeros_like(made.anti_windup)
+        return replace(setting, law=replace(made, **guards))
+
+    return change
+
+
+@record(eq=False)
+class _Numbers:
+    """The numbers of a law, those it is affine in and those it is not."""
+
+    gains: Gains
+
+    @property
+    def linear(self) -> Float[np.ndarray, " k"]:
+        """The gains that the law is affine in, none of them zero: k_p, k_i, k_d, k_r, c k_d, and k_v of a cascade."""
+        g = self.gains
+        size = 1.0 + abs(g.k_p)
+        natural = [size, size, size * g.T_f, size, size * g.T_f] + ([] if g.inner is None else [1.0])
+        stated = [g.k_p, g.k_i, g.k_d, g.k_r, g.c * g.k_d] + ([] if g.inner is None else [g.inner.k_v])
+        return np.array([a or SMALL * b for a, b in zip(stated, natural, strict=True)])
+
+    @property
+    def times(self) -> dict[str, float]:
+        """The numbers that it is not affine in, by name."""
+        others = {*LAW_GAINS, "k_v", "k_ff"} - {"T_f"}
+        return {name: value for name, value in self.gains.by_name().items() if name not in others}
+
+    def make(self, linear: Float[np.ndarray, " k"], times: Mapping[str, float]) -> Gains:
+        """Return the gains of other numbers."""
+        k_p, k_i, k_d, k_r, rate, *inner = (float(value) for value in linear)
+        g, stated = self.gains, self.gains.by_name() | dict(times)
+        stated |= {"k_p": k_p, "k_i": k_i, "k_d": k_d, "k_r": k_r, "c": rate / k_d if k_d else 0.0}
+        stated |= {"k_v": inner[0]} if inner else {}
+        observer = None if g.observer is None else replace(g.observer, T_q=stated["T_q"])
+        return Gains.from_names(stated, observer, None if g.inner is None else g.inner.speed, g.link)
+
+
+def fit_gains(setting: Setting) -> Gains | None:
+    """Return the gains with which a setting's law is nearest to the logged commands; None where it has none with
+    names, or the command is at its limit too often.
+    """
+    from scipy.optimize import least_squares  # deferred: 0.1 s
+
+    own, stretches = read_gains(setting.controller), _find_free(setting)
+    if own is None or not isinstance(setting.law, RunnableLaw) or not stretches:
+        return None
+    numbers, scale = _Numbers(gains=own), float(np.std(setting.ticks.command))
+    names, first = list(numbers.times), np.log(list(numbers.times.values()))
+
+    def solve(z: Float[np.ndarray, " t"]) -> tuple[Gains, Float[np.ndarray, " n"]]:
+        return _project(setting, stretches, numbers, dict(zip(names, np.exp(z), strict=True)))
+
+    best: tuple[float, Gains] | None = None
+    for factor in STARTS:
+        start, reach = first + np.log(factor), np.log(REACH)
+        try:
+            found = least_squares(
+                lambda z: solve(z)[1] / scale, start, bounds=(first - reach, first + reach), diff_step=STEP, xtol=1e-12
+            )
+            off, gains = math.sqrt(float(np.mean(found.fun**2))), solve(found.x)[0]
+        except (SeaoptError, np.linalg.LinAlgError, ValueError):  # no law of these numbers can run
+            continue
+        if best is None or off < best[0]:
+            best = off, gains
+        if off < FLOOR:
+            break
+    return None if best is None else best[1]
+
+
+def _project(
+    setting: Setting, stretches: Sequence[Ticks], numbers: _Numbers, times: Mapping[str, float]
+) -> tuple[Gains, Float[np.ndarray, " n"]]:
+    """Return the best gains at given time constants, and what they and the best states at the start of each stretch
+    leave of the commands.
+    """
+    own = numbers.linear
+    # Where each gain is half as large again, of which the commands change by half of its column.
+    points = [own, *(own + 0.5 * step for step in np.diag(own))]
+    laws = [make_law(setting.controller, numbers.make(each, times))(setting).linear for each in points]
+    parts = [_leave_states(laws, ticks) for ticks in stretches]
+    table, target = (np.concatenate(each) for each in zip(*parts, strict=True))
+    size = np.maximum(np.linalg.norm(table, axis=0), np.finfo(float).tiny)
+    solved = np.linalg.lstsq(table / size, target, rcond=1e-12)[0] / size
+    return numbers.make(own * (1.0 + 0.5 * solved), times), target - table @ solved
+
+
+def _leave_states(
+    laws: Sequence[RunnableLaw], ticks: Ticks
+) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+    """Return what each of the laws makes more than the first, and the logged commands less those of the first, from
+    zero, both without what a state at the first row adds.
+    """
+    first, *others = (_respond(law, ticks) for law in laws)
+    basis = np.linalg.qr(first[1] / np.maximum(np.linalg.norm(first[1], axis=0), np.finfo(float).tiny))[0]
+    columns = np.column_stack([*(out - first[0] for out, _ in others), ticks.command - first[0]])
+    columns -= basis @ (basis.T @ columns)
+    return columns[:, :-1], columns[:, -1]
+
+
+def _respond(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
+    """Return the commands of a law that starts from zero, and what each state at the first row adds to them, where no
+    limit is active.
+    """
+    from scipy.signal import fftconvolve  # deferred: 0.3 s
+
+    n = len(ticks)
+    direct, drive = drive_law(law, ticks)
+    rows = list_powers(law.c, law.a, n)
+    out = direct.copy()
+    for row, values in zip(rows.T, drive.T, strict=True):
+        out[1:] += fftconvolve(row, values)[: n - 1]
+    return law.per_effort * out, law.per_effort * rows
+
+
+def _find_free(setting: Setting) -> list[Ticks]:
+    """Return the longest runs of rows in which no command is at a limit, up to some rows in all; none where they are
+    few.
+    """
+    ticks = setting.ticks
+    limited = find_limited(ticks) | (np.abs(ticks.command) >= AT_LIMIT * setting.linear.command_limit)
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], limited, [True]]).astype(int))).reshape(-1, 2)
+    edges = edges[np.argsort(edges[:, 0] - edges[:, 1], kind="stable")][:RUNS]
+    found, left = list[Ticks](), MOST
+    for start, stop in edges:
+        rows = min(int(stop - start), left)
+        if rows >= max(SHORTEST, PER_STATE * setting.linear.c.size):
+            found.append(ticks.take(slice(int(stop) - rows, int(stop))))
+            left -= rows
+    return found if MOST - left >= FEWEST else []
+
+
+def find_same(gains: Gains, others: Mapping[str, Controller]) -> str | None:
+    """Return which of other laws has these gains; None where none has."""
+    found = gains.by_name()
+    for name, other in others.items():
+        stated: dict[str, Any] = dict(other.gains)
+        if stated.keys() == found.keys() and all(
+            abs(found[key] - stated[key]) <= SAME_GAINS * abs(stated[key]) for key in found
+        ):
+            return name
+    return None
