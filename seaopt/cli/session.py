@@ -229,7 +229,11 @@ class Session:
                 self._check_spec(law.spec)
             else:
                 law = ScheduledController.from_dict(
-                    content, self.problem.design_plant, self.values(), self.problem.robust_to(source)
+                    content,
+                    self.problem.design_plant,
+                    self.values(),
+                    self.problem.robust_to(source),
+                    self.problem.draws(source),
                 )
                 if (law.over, list(law.points)) != (schedule.over, schedule.points):
                     raise ProblemError(

@@ -90,7 +90,7 @@ class ScheduleSweep:
                 schedule.design,
                 {**place_plants(schedule.others, self.over, value), **seen},
                 schedule.outer,
-                self.draws if value in schedule.points else (),  # as a schedule is judged
+                self.draws,
             )
             law, free = schedule.table.law(value), None
             if free_law and value in schedule.points and isinstance(task.plants[0], DigitalPlant):

@@ -78,6 +78,8 @@ class ScheduledController(Result, Worded):
         The point whose law counts until a finite value of the variable was read.
     between : tuple of PlaceFigures
         What was found between the points.
+    draws : sequence of mappings
+        As in `seaopt.tune`: of every plant, at which it is judged besides.
     """
 
     over: str
@@ -87,6 +89,7 @@ class ScheduledController(Result, Worded):
     others: Plants
     fallback: float
     between: tuple[PlaceFigures, ...] = ()
+    draws: Draws = ()
 
     @property
     def table(self) -> GainTable:
@@ -149,7 +152,7 @@ class ScheduledController(Result, Worded):
 
     @property
     def plants_at_points(self) -> tuple[str, ...]:
-        """The plants on which it is judged at the points alone, and not between them: draws, witnesses, responses."""
+        """The plants on which it is judged at the points alone, and not between them: witnesses, responses."""
         if not self.between:
             return ()
         judged = self.at(self.between[0].value).robust_to
@@ -208,13 +211,16 @@ class ScheduledController(Result, Worded):
             frozen = self.controllers[self.points.index(value)]
         else:
             spec, first = replace(self.spec, bandwidth_hz=self.asked_hz(value)), self.controllers[0]
-            frozen = freeze(self.table, value, spec, self.design, self.others, self.outer)
+            frozen = self._freeze(value, spec)[0]
             kept = {"gate": first.gate, "derate": first.derate}
             frozen = replace(frozen, compensation=self.terms_at(value), **kept)
         if value in self.points and not self.table.nominals:
             return frozen
         share = self.table.find_numbers(value, **{SHARE: self.runnable().anti_windup})[SHARE]
         return replace(frozen, share=share)
+
+    def _freeze(self, value: float, spec: ControllerSpec) -> tuple[Controller, list[MeasuredLoop]]:
+        return freeze(self.table, value, spec, self.design, self.others, self.outer, self.draws)
 
     def terms_at(self, value: float) -> Compensation | None:
         """Return what it compensates at a value, between the points interpolated."""
@@ -233,7 +239,7 @@ class ScheduledController(Result, Worded):
     def _judge_place(self, value: float) -> PlaceFigures:
         """Judge the law at a value between the points: all limits, and 0.9 of the bandwidth that is asked there."""
         asked, spec = self.asked_hz(value), replace(self.spec, bandwidth_hz=self.asked_hz(value))
-        frozen, loops = _freeze(self.table, value, spec, self.design, self.others, self.outer)
+        frozen, loops = self._freeze(value, spec)
         measured = {loop.name: loop.figures for loop in loops}
         others = place_plants(self.others, self.over, value).items()
         closed = (measured.get(name) or close_outer(frozen, *case).figures() for name, case in others)
@@ -292,10 +298,15 @@ class ScheduledController(Result, Worded):
 
     @classmethod
     def from_dict(
-        cls, content: Mapping[str, Any], plant: Plant, params: ParameterSet, others: Plants | None = None
+        cls,
+        content: Mapping[str, Any],
+        plant: Plant,
+        params: ParameterSet,
+        others: Plants | None = None,
+        draws: Draws = (),
     ) -> ScheduledController:
-        """Return the schedule of a controller.json; what it achieves is computed again. Raises FileError: a field is
-        missing or malformed, or contradicts another.
+        """Return the schedule of a controller.json; what it achieves is computed again, at `draws` too. Raises
+        FileError: a field is missing or malformed, or contradicts another.
         """
         from seaopt.control.scheduling.stored import read_points  # deferred: pydantic
 
@@ -310,6 +321,7 @@ class ScheduledController(Result, Worded):
             ),
             others=others or {},
             fallback=table.fallback,
+            draws=draws,
         ).with_places()
 
 
@@ -390,25 +402,14 @@ def freeze(
     design: tuple[Plant, ParameterSet],
     others: Plants,
     outer: OuterLoop | None = None,
-) -> Controller:
-    """Return the controller of a table's gains at a value, judged on the plants there by all but the bandwidth asked.
-    The limits that depend on the bandwidth, such as a droop up to a third of it, are those of the bandwidth it has.
-    `outer` runs around it.
-    """
-    return _freeze(table, value, spec, design, others, outer)[0]
-
-
-def _freeze(
-    table: GainTable,
-    value: float,
-    spec: ControllerSpec,
-    design: tuple[Plant, ParameterSet],
-    others: Plants,
-    outer: OuterLoop | None,
+    draws: Draws = (),
 ) -> tuple[Controller, list[MeasuredLoop]]:
-    """Return the controller of a table's gains at a value with its loops on the plants there."""
+    """Return the controller of a table's gains at a value with its loops on the plants there, judged by all but the
+    bandwidth asked. The limits that depend on the bandwidth, such as a droop up to a third of it, are those of the
+    bandwidth it has. `outer` runs around it.
+    """
     plant, params = design[0], place_variable(*design, table.over, value)
-    task = make_place_task(table, value, spec, design, place_plants(others, table.over, value), outer)
+    task = make_place_task(table, value, spec, design, place_plants(others, table.over, value), outer, draws)
     gains, law = table.find_gains(value), table.law(value)
     loops = task.measure_law(
         law,

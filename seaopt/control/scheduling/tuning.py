@@ -98,8 +98,8 @@ def tune_schedule(
     draws : sequence of mappings, optional
         As in `seaopt.tune`.
     witnesses : mapping of name to (Plant, ParameterSet), optional
-        More plants on which every plant's limits are kept at the points, such as draws; between the points the law is
-        not judged on them.
+        More plants on which every plant's limits are kept at the points, such as the worst draws of a certificate;
+        between the points the law is not judged on them.
     near : ScheduledController, optional
         A schedule of these points, or of some of them, under other limits or on other plants: a point that it
         has is started from its gains there, any other from its neighbour's, and none from a scan at an end.
@@ -173,6 +173,7 @@ def tune_schedule(
             controllers=tuple(controllers),
             others=others,
             fallback=float(places[0]),
+            draws=tuple(draws),
         ).with_places()
 
     alone, around = divide(progress, 1.0, 1.0 * (outer is not None))

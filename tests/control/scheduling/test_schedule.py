@@ -237,16 +237,30 @@ def test_witnesses_are_kept_at_the_points_and_the_fallback_has_the_least_ms(stan
         assert schedule.fallback == points[int(np.argmin(worst))]
 
 
-def test_plants_that_are_judged_at_the_points_alone_are_named(stand, thor):
-    """Here a draw breaks the limit between them, of which the verdict knows nothing."""
+def test_draws_are_judged_between_the_points_and_what_is_not_is_named(stand, thor):
+    """A draw that every point keeps breaks the limit between two: at that value, and with a point there it is kept."""
     points, drawn, value = [3e5, 9e5], {"J": 0.6 * thor["J"].value}, 6e5
     spec = so.ControllerSpec(bandwidth_hz=30, structure="pid", max_sensitivity=1.6, max_noise_gain=60)
     schedule = tune_schedule(stand, thor, spec, "k", points, {"other": stand}, draws=[drawn])
-    assert schedule.met and schedule.at(value).close(stand, thor.update(k=value, **drawn)).figures().ms > 1.7
-    names = schedule.plants_at_points
-    assert len(names) == 2 and all("J = " in name for name in names)
-    (said,) = describe_plants_at_points(schedule)
-    assert said.startswith(f"Not judged between the points, only at them: {names[0]} and 1 more plant")
+    assert all(law.met for law in schedule.controllers) and not schedule.met and not schedule.plants_at_points
+    z = np.exp(2j * np.pi * np.geomspace(1.0, 499.0, 4000) * 1e-3)
+
+    def find_ms(law, at):
+        return np.max(np.abs(law.close(stand, thor.update(k=at, **drawn)).to_control()(z)[0, 0]))
+
+    for place in schedule.between:
+        over = find_ms(schedule.at(place.value), place.value) > 1.6
+        assert over == any("max_sensitivity" in name for name in place.broken)
+    assert find_ms(schedule.at(value), value) > 1.7
+    witness = {"a draw": (stand, thor.update(**drawn))}
+    at_points = tune_schedule(stand, thor, spec, "k", points, {"other": stand}, witnesses=witness)
+    assert at_points.met and at_points.plants_at_points == ("a draw",)
+    (said,) = describe_plants_at_points(at_points)
+    assert said.startswith("Not judged between the points, only at them: a draw")
+    again = ScheduledController.from_dict(
+        json.loads(to_json(schedule.to_dict())), *schedule.design, schedule.others, [drawn]
+    )
+    assert [place.broken for place in again.between] == [place.broken for place in schedule.between]
     assert not tune_knee().plants_at_points and not describe_plants_at_points(tune_knee())
 
 

@@ -119,7 +119,7 @@ def schedule():
         over="phi", unit="rad", points=np.array(points), gains={name: np.array(row) for name, row in GAINS.items()},
         structure="pid", sample_time_s=TS,
     )  # fmt: skip
-    controllers = tuple(freeze(table, point, spec, (stand, values), others) for point in points)
+    controllers = tuple(freeze(table, point, spec, (stand, values), others)[0] for point in points)
     return ScheduledController(
         over="phi", unit="rad", points=points, controllers=controllers, others=others, fallback=0.35
     ).with_places()
