@@ -56,6 +56,7 @@ class Cause:
     explains: bool  # leaves nothing but rounding
     gains: Mapping[str, float] | None = None  # of a law with another set of them, as fitted
     exported: Mapping[str, float] | None = None  # those of this law
+    sigmas: float | None = None  # stds of rounding, over the whole log, of what no single tick shows
     besides: bool = False  # it is so beside the first cause, and removes what it does together with that
 
     @property
@@ -190,6 +191,11 @@ def list_alternatives(setting: Setting, others: Mapping[str, Controller]) -> Ite
     yield from _list_of_guards(setting)
     yield from _list_of_gains(setting)
     yield from _list_places(setting)
+    yield from list_others(setting, others)
+
+
+def list_others(setting: Setting, others: Mapping[str, Controller]) -> Iterator[Alternative]:
+    """Yield laws that may have run in its place, of those that read the same."""
     signals = setting.controller.signals
     for name, other in others.items():
         if other.signals == signals:

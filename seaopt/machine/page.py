@@ -105,6 +105,10 @@ TWO_AMPLITUDES = (
 IN_PART = (
     "No row explains all of it. An interval holds where nothing but its row differs; the true size may be outside."
 )
+HIDDEN = (
+    "In {} no tick is off by more than rounding allows, but all of them together are: what that cause makes stands out "
+    "of the rounding of the whole log by {} std."
+)
 AND = "with the first one also: "
 UNTOLD = {
     "short, gain": "a law whose {} is half as large",
@@ -490,6 +494,11 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         f"{Path(source).name} does not exclude that {', or that '.join(map(say_cause, row.possible))}."
         for source, row in zip(result.sources, result.replays, strict=True)
         if row.met and row.possible
+    )
+    remarks += tuple(
+        HIDDEN.format(Path(source).name, format_number(row.causes[0].sigmas, 2))
+        for source, row in zip(result.sources, result.replays, strict=True)
+        if row.causes and row.causes[0].sigmas is not None
     )
     sections = [
         Section(

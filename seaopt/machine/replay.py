@@ -17,8 +17,9 @@ from seaopt.control import Controller
 from seaopt.formatting import join_words
 from seaopt.machine.causes import Cause, find_causes, leave_open
 from seaopt.machine.decimated import SAME_RATE, LineMatch, count_ticks_per_row, match_lines
+from seaopt.machine.hidden import find_hidden
 from seaopt.machine.open_loop import find_unfollowed
-from seaopt.machine.stepped import Match, Setting, Source, make_setting, play
+from seaopt.machine.stepped import FLOOR, Match, Setting, Source, make_setting, play
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
@@ -87,6 +88,8 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
     if match.met and abs(rate_hz / law_rate_hz - 1.0) > SAME_RATE:
         causes = (Cause(kind="rate", what="clock", value=rate_hz, unit="Hz", removes=1.0, explains=True),)
     allowed, rms = math.sqrt(float(np.mean(match.allowed**2))), float(np.std(ticks.command))
+    if match.met and not causes and match.energy > (FLOOR * rms) ** 2:
+        causes = find_hidden(whole, match, others or {})
     if match.met and not causes and allowed > COARSEST * rms:
         causes = (leave_open("rounding", "log", allowed),)
     met = match.met and not causes

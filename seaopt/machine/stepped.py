@@ -195,11 +195,11 @@ class Match:
         """Whether nothing is left but rounding, in all and within stretches."""
         if self.energy > ROUNDING**2 * float(np.mean(self.allowed**2)):
             return False
-        within = _leave_integrals(self.error, self.integrals)
+        within = leave_integrals(self.error, self.integrals)
         return float(np.mean(within**2)) <= (ROUNDING * self.allowed_within) ** 2
 
 
-def _leave_integrals(error: Float[np.ndarray, " n"], integrals: int) -> Float[np.ndarray, " n"]:
+def leave_integrals(error: Float[np.ndarray, " n"], integrals: int) -> Float[np.ndarray, " n"]:
     """Return an error without what integrals make of it between stretches: in each, the polynomial of so many terms
     that is nearest to it.
     """
@@ -210,7 +210,8 @@ def _leave_integrals(error: Float[np.ndarray, " n"], integrals: int) -> Float[np
     return np.concatenate(left)
 
 
-def _count_integrals(law: RunnableLaw) -> int:
+def count_integrals(law: RunnableLaw) -> int:
+    """Return how many integrals a law has."""
     return int(np.count_nonzero(np.abs(np.linalg.eigvals(law.a) - 1.0) < INTEGRATES)) if law.c.size else 0
 
 
@@ -246,7 +247,7 @@ def play(setting: Setting) -> Match:
         commands=commands,
         allowed=allowed,
         error=commands - ticks.command,
-        integrals=_count_integrals(linear),
+        integrals=count_integrals(linear),
         allowed_within=allowed_within,
     )
 
@@ -337,7 +338,7 @@ def _allow(law: RunnableLaw, ticks: Ticks, *, rounded: bool) -> tuple[Float[np.n
     """
     from scipy.signal import fftconvolve  # deferred: 0.3 s
 
-    n, integrals = len(ticks), _count_integrals(law)
+    n, integrals = len(ticks), count_integrals(law)
     response = find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
     steps: list[Any] = []
     if np.unique(ticks.reference).size >= LEVELS:
@@ -356,5 +357,5 @@ def _allow(law: RunnableLaw, ticks: Ticks, *, rounded: bool) -> tuple[Float[np.n
             for edge in find_edges(values):
                 walk = fftconvolve(edge.astype(float), impulse)[:n]
                 variance += each * walk**2
-                within += each * float(np.mean(_leave_integrals(walk, integrals) ** 2))
+                within += each * float(np.mean(leave_integrals(walk, integrals) ** 2))
     return np.sqrt(np.maximum(variance, np.finfo(float).tiny)), math.sqrt(within)
