@@ -260,6 +260,8 @@ def accept(
         return replace(result, response=response, left_out=left_out)
     draws = list_draws(law, uncertainty, ranges, DRAWS, SEED)
     differences = compare(law, response.measured, whole, draws, confidence)
+    if differences is not None and differences.prediction is not None:
+        response = judge_response(law, join_blocks(blocks), confidence, prediction=differences.prediction)
     first = differences.found[0] if differences is not None and differences.found else None
     if first is not None and first.kind == "rate" and first.size and first.explains >= EXPLAINED:
         # The figures are of the machine's seconds, and the log is none for a fit.

@@ -19,6 +19,7 @@ def list_panels(result: Acceptance) -> list[Panel]:
     alpha, design = 1.0 - response.confidence, controller.design
     loop = None if design is None else controller.close(*design)
     ms, spec = controller.spec.level("max_sensitivity"), controller.spec
+    predicted = "predicted, as it slides" if response.friction is not None else "predicted"
 
     def draw_sensitivity(axis: Any) -> None:
         for part in response.measured:
@@ -29,7 +30,7 @@ def list_panels(result: Acceptance) -> list[Panel]:
             _draw_lines(axis, part, to_decibel(1.0 / distance), low, high)
         if loop is not None:
             f = _spread(response.measured)
-            axis.plot(f, to_decibel(loop.sensitivity(f)), color=VERMILION, linewidth=1.2, label="predicted")
+            axis.plot(f, to_decibel(loop.sensitivity(f)), color=VERMILION, linewidth=1.2, label=predicted)
         draw_level(axis, None if ms is None else ms * (1.0 + GRACE), "Ms = {:g}", decibel=True)
 
     def draw_tracking(axis: Any) -> None:
@@ -41,7 +42,7 @@ def list_panels(result: Acceptance) -> list[Panel]:
             )
         if loop is not None:
             f = _spread(response.measured)
-            axis.plot(f, to_decibel(loop.tracking(f)), color=VERMILION, linewidth=1.2, label="predicted")
+            axis.plot(f, to_decibel(loop.tracking(f)), color=VERMILION, linewidth=1.2, label=predicted)
         axis.axhline(-3.0103, color=LIMIT, linestyle=":", linewidth=0.9, label="-3 dB")
         draw_level(axis, spec.bandwidth_hz, "asked: {:g} Hz", side="x")
 

@@ -85,6 +85,15 @@ STUCK = (
     "The bandwidth that is judged is that of the machine that is stuck, which any amplitude has: it is not the {} that "
     "was asked of the machine as it slides. At the amplitude of the log it is {}{}."
 )
+SLIDES = "Predicted is the actuator as it slides, but for a figure stuck; its bandwidth is {}."
+PLAYED = (
+    "Predicted is the certified machine under the reference of the log, simulated: with dry friction it is another one "
+    "at another amplitude; its bandwidth is {}."
+)
+AS_PLAYED = (
+    "The bandwidth that is judged is the least that certified machines have under this reference, {}: it is not the {} "
+    "that was asked of the machine as it slides. Here it is {}{}."
+)
 REACHES = ", which is what was asked"
 FASTER = ", {} times what was asked: nothing bounds it above, so look at Ms and Mt"
 WORTH = (
@@ -208,7 +217,10 @@ def _say_part(each: Difference) -> str:
             return f"the loop is {abs(1e3 * each.value):.3g} ms {way} than certified"
         case "mode":
             pole = "" if each.size is None else f", its pole at {format_number(each.value / each.size, 3)} Hz"
-            return f"there is a mode at {format_number(each.value, 3)} Hz{pole}"
+            size = (
+                "" if each.changes is None else f", which changes the response {format_number(each.changes, 2)} times"
+            )
+            return f"there is a mode at {format_number(each.value, 3)} Hz{pole}{size}"
         case "drive limit":
             level = f"{format_number(each.value, 3)}{unit_after(each.unit)}"
             return f"the drive gives at most {level} of what is commanded"
@@ -268,10 +280,23 @@ def _say_stuck(row: Judged, controller: Controller) -> str:
     """Return of which bandwidth the row is, and which one was asked."""
     asked, value = controller.spec.bandwidth_hz, row.value or 0.0
     sizes = [f"{format_number(each, 3)} Hz" for each in (asked, value, row.limit)]
-    reaches = FASTER.format(format_number(value / asked, 2)) if value > TWICE * asked else REACHES
-    said = STUCK.format(*sizes[:2], reaches if value >= (1.0 - SHORT_BY) * asked else SHORT)
+    said = STUCK.format(*sizes[:2], _say_reached(value, asked))
     little = row.limit is not None and row.limit < LITTLE * asked
     return said + (WORTH.format(sizes[2], f"{100.0 * (row.limit or 0.0) / asked:.0f} %") if little else "")
+
+
+def _say_as_played(row: Judged, controller: Controller) -> str:
+    """Return of which bandwidth the row is, and which one was asked."""
+    asked, value = controller.spec.bandwidth_hz, row.value or 0.0
+    sizes = [f"{format_number(each, 3)} Hz" for each in ((row.limit or 0.0) / (1.0 - SHORT_BY), asked, value)]
+    return AS_PLAYED.format(*sizes, _say_reached(value, asked))
+
+
+def _say_reached(value: float, asked: float) -> str:
+    """Return whether a bandwidth is what was asked."""
+    if value < (1.0 - SHORT_BY) * asked:
+        return SHORT
+    return FASTER.format(format_number(value / asked, 2)) if value > TWICE * asked else REACHES
 
 
 def _say_refuted(row: Judged) -> str:
@@ -299,7 +324,7 @@ def _say_undecided(response: Response) -> str:
             f"at least {FEWEST_LINES} lines from {low} to {high} Hz, each at most {CLOSEST:g} times the one before"
         )
     if periods := max((row.periods or 0 for row in rows), default=0):
-        record.append(f"{periods} periods in all")
+        record.append(f"{periods} periods in all ({format_number(periods * response.period_s, 3)} s)")
     wanted = join_words(record) or "more periods, or a larger reference"
     others = [f"{join_words([_name(row) for row in rows])}: record {wanted}"] if rows else []
     return "; ".join([*others, *near])
@@ -371,11 +396,13 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     ]
     if response.rate != 1.0:
         remarks.append(RATE.format(format_number(response.rate, 3)))
-    if show_stuck_bandwidth(result.controller):
+    played = result.differences is not None and result.differences.prediction is not None
+    if show_stuck_bandwidth(result.controller) or played:
         both = say_bandwidths(result.controller, result.controller.achieved.bandwidth_hz)
-        remarks.append(f"Predicted is the actuator as it slides, but for a figure stuck; its bandwidth is {both}.")
+        remarks.append((PLAYED if played else SLIDES).format(both))
     remarks += explain_sliding(result.controller)
     remarks += [_say_stuck(row, result.controller) for row in response.judged if row.state == "stuck"]
+    remarks += [_say_as_played(row, result.controller) for row in response.judged if row.state == "as played"]
     if response.still:
         unit = unit_after(result.controller.command.effort_unit)
         sizes = (f"{format_number(value, 3)}{unit}" for value in (response.effort, response.friction))
@@ -413,7 +440,7 @@ def _show_range(each: Difference) -> str:
     """Return an interval, of a delay in ms as it is said."""
     if each.low is None or each.high is None:
         return ""
-    scale, unit = (1e3, " ms") if each.kind == "delay" else (1.0, "")
+    scale, unit = {"delay": (1e3, " ms"), "mode": (1.0, " Hz")}.get(each.kind, (1.0, ""))
     return f"{format_number(scale * each.low, 3)} to {format_number(scale * each.high, 3)}{unit}"
 
 

@@ -186,7 +186,8 @@ def test_a_stage_moves_the_motor_against_its_friction_or_says_that_it_does_not(
     assert result.replayed and result.response.still is not moves
     (row,) = (each for each in result.response.judged if each.name == "bandwidth")
     said = " ".join(repr(result).split())
-    assert row.state == "stuck" and row.limit < 10.0 and "not the 20 Hz that was asked" in said
+    assert row.state == "as played" and "not the 20 Hz that was asked" in said
+    assert row.limit <= 0.9 * row.predicted and abs(row.value / row.predicted - 1.0) < 0.1, row
     assert ("dry friction held the motor" in said) is not moves
 
 

@@ -273,6 +273,23 @@ def dry(compiler, tmp_path_factory):
     return Bench(compiler, tmp_path_factory.mktemp("dry"), law), played.reference
 
 
+def test_with_dry_friction_what_is_predicted_is_of_the_reference_that_was_played(dry):
+    """The simulator's right machine has the figures that stand beside its own; as it slides they are others."""
+    bench, reference = dry
+    machine = replace(Machine(), coulomb=FRICTION, smoothing=5e-3)
+    result = so.accept(bench.controller, [bench.log(machine, reference, noise=0.5)])
+    rows = {row.name: row for row in result.response.judged if row.predicted is not None}
+    assert {"Ms", "Mt", "reference peak", "bandwidth", "phase margin"} <= rows.keys()
+    assert all(np.isclose(row.value, row.predicted, rtol=0.03) for row in rows.values()), rows
+    assert rows["bandwidth"].state == "as played" and rows["bandwidth"].outcome == "confirmed"
+    sliding = bench.controller.achieved
+    assert abs(sliding.phase_margin_deg - rows["phase margin"].value) > 3.0
+    assert "under the reference of the log, simulated" in " ".join(repr(result).split())
+    harder = so.accept(bench.controller, [bench.log(replace(machine, coulomb=3.0 * FRICTION), reference, noise=0.5)])
+    (slower,) = (row for row in harder.response.judged if row.name == "bandwidth")
+    assert slower.outcome == "refuted" and slower.value < slower.limit < rows["bandwidth"].value, slower
+
+
 @pytest.mark.slow
 def test_with_dry_friction_the_machine_is_predicted_at_the_amplitude_that_was_played(dry):
     bench, reference = dry
@@ -293,7 +310,7 @@ def test_with_dry_friction_fewer_than_six_sets_of_phases_confirm_nothing(dry):
     assert "0 of 5 limits confirmed, 0 refuted" in text
     assert "its bandwidth is 30 Hz sliding and" in text
     assert (
-        "the log does not decide stability, Ms, Mt, reference peak and bandwidth, stuck: record 6 sets of random"
+        "the log does not decide stability, Ms, Mt, reference peak and bandwidth, as played: record 6 sets of random"
         in text
     )
 

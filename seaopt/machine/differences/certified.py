@@ -20,8 +20,9 @@ from seaopt.machine.differences.explanations import explain
 from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
 from seaopt.machine.differences.size_fit import Difference
+from seaopt.machine.response.judged import Measured, Prediction
 from seaopt.machine.response.periods import shorten
-from seaopt.machine.response.verdicts import Measured, has_dry_friction
+from seaopt.machine.response.verdicts import has_dry_friction, predict_response
 from seaopt.machine.ticks import Ticks, find_edges
 from seaopt.records import record
 from seaopt.robustness.uncertainty.worst import place_values
@@ -43,6 +44,7 @@ class Differences:
     found: tuple[Difference, ...]
     nearest: Mapping[str, float]  # of the certificate's draws, the values of the one that is nearest
     nearest_misfit: float | None
+    prediction: Prediction | None = None  # with dry friction
 
 
 def compare(
@@ -67,7 +69,9 @@ def compare(
     nominal = plant.complete(values)
     response, count = comparison.response, comparison.f.size
     draws = draws[:SIMULATED] if dry else draws
-    drawn = comparison.predict([values, *(place_values(plant, values, draw) for draw in draws)])
+    sets = [values, *(place_values(plant, values, draw) for draw in draws)]
+    simulated = comparison.simulate(sets) if dry else []
+    drawn = [*map(comparison.read, simulated)] if dry else comparison.predict(sets)
     model, drawn = drawn[0], np.array(drawn[1:]).reshape(-1, count)
     before = comparison.misfit(model)
     reach = np.max(np.abs(drawn - model), axis=0, initial=0.0)
@@ -91,6 +95,7 @@ def compare(
         found=tuple(found),
         nearest={} if best is None else dict(draws[best]),
         nearest_misfit=None if best is None else misfits[best] / count,
+        prediction=predict_response(controller, simulated) if dry else None,
     )
 
 

@@ -92,7 +92,7 @@ class Comparison:
     def predict(self, sets: Sequence[ParameterSet]) -> list[Lines]:
         """Return the responses of the model with each of some values."""
         if self.simulates and sets:
-            return [self._read(groups) for groups in self.simulate(sets)]
+            return [self.read(groups) for groups in self.simulate(sets)]
         return [self.linearise(values) for values in sets]
 
     def linearise(self, values: ParameterSet) -> Lines:
@@ -128,7 +128,7 @@ class Comparison:
         effort = forward * blocks.reference + np.sum(np.array(feedback) * blocks.measured, axis=1)
         return replace(blocks, effort=effort)
 
-    def _read(self, groups: Sequence[Blocks]) -> Lines:
+    def read(self, groups: Sequence[Blocks]) -> Lines:
         """Return the responses of periods to the effort, signal by signal, amplitude by amplitude."""
         parts = list[Lines]()
         for group in groups:

@@ -109,7 +109,7 @@ def explain(
         comparison=comparison, beside=beside, logs=logs, values=values, spread=spread, model=model, slopes=slopes,
         before=before,
     )  # fmt: skip
-    tried = [*_try_parameters(case), *_try_shapes(case.fit, model), *_try_rate(comparison, values, spread)]
+    tried = [*_try_parameters(case), *_try_shapes(case), *_try_rate(comparison, values, spread)]
     tried = sorted((each for each in tried if each.left < before), key=lambda each: each.rank)
     if not tried:
         return []
@@ -284,17 +284,29 @@ def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> I
     yield Tried(difference=difference, left=best.left, response=best.response)
 
 
-def _try_shapes(fit: SizeFit, model: Lines) -> Iterator[Tried]:
+def _try_shapes(case: Case) -> Iterator[Tried]:
     """Yield a gain, a delay and a mode, each with the size that fits best."""
-    f = fit.comparison.f
+    f, fit, model = case.comparison.f, case.fit, case.model
     late = lambda x: model * np.exp(-2j * np.pi * f * x[0])  # noqa: E731
     for kind, unit, make, start in (("gain", "-", lambda x: model * x[0], 1.0), ("delay", "s", late, 0.0)):
         best = fit.solve(make, [start])
         value, reach = float(best.sizes[0]), SURE * float(best.stds[0])
         low, high = value - reach, value + reach
         difference = Difference(kind=kind, name=kind, value=value, low=low, high=high, unit=unit, explains=0.0)
-        yield Tried(difference=difference, left=best.left, response=best.response)
+        shaped = Tried(difference=difference, left=best.left, response=best.response)
+        moves = kind == "delay" and value > 0.0 and case.comparison.simulates
+        yield _simulate_delay(case, shaped) if moves else shaped
     yield from _try_mode(fit, model)
+
+
+def _simulate_delay(case: Case, shaped: Tried) -> Tried:
+    """Return the delay that fits best, from one on that is about it: with dry friction the loop moves otherwise."""
+    knob = make_delay(case.comparison.controller.sample_time_s)
+    size = np.array([shaped.difference.value / knob.sample_time_s])
+    search = Search(knobs=(knob,), sizes=size, model=case.model, slopes=case.slopes)
+    (model,) = case.comparison.predict([search.place(case.values)])
+    found = refine(case.comparison, case.spread, case.values, [replace(search, model=model)])
+    return found[0].conclude(case.values) if found else shaped
 
 
 def _try_mode(fit: SizeFit, model: Lines) -> Iterator[Tried]:
@@ -337,9 +349,12 @@ def _try_mode(fit: SizeFit, model: Lines) -> Iterator[Tried]:
                     best = found, float(hertz / take(found.sizes, 2)[0]) if shape is divide else None
     if best is not None:
         found, size = best
+        value, far = float(take(found.sizes, 0)[0]), SURE * float(found.stds[0])
+        low, high = (value * math.exp(-far), value * math.exp(far)) if far < 1.0 else (None, None)
+        changes = np.abs(np.log(np.abs(found.response / model)))
         difference = Difference(
-            kind="mode", name="mode", value=float(take(found.sizes, 0)[0]), low=None, high=None, unit="Hz",
-            explains=0.0, size=size,
+            kind="mode", name="mode", value=value, low=low, high=high, unit="Hz", explains=0.0, size=size,
+            changes=math.exp(float(np.max(changes))),
         )  # fmt: skip
         # it has some sizes where others have one
         yield Tried(difference=difference, left=found.left + 3.0, response=found.response)

@@ -34,6 +34,7 @@ class Difference:
     alike: tuple[str, ...] = ()  # parameters that would explain as much
     alike_values: tuple[float, ...] = ()  # their factors
     size: float | None = None  # of a mode: its zero's frequency over its pole's; of a rate: over that of the log
+    changes: float | None = None  # of a mode: by which factor the response at a line is another one, at most
     beside: tuple[Difference, ...] = ()  # what differs besides, of two that explain it together
     untold: bool = False  # the log does not tell it from the one that is named first
 

@@ -30,7 +30,9 @@ class Judged:
     where_hz: float | None  # the line that decides, or is the nearest to deciding
     periods: int | None  # in all, that would decide where it is undecided
     predicted: float | None = None  # of the design plant
-    state: str = ""  # of the machine whose limit and prediction these are: "stuck", by dry friction
+    # Of the machine whose limit and prediction these are, by dry friction: "stuck", or "as played", which is that of
+    # the certified machines under the reference that was played.
+    state: str = ""
     near: float | None = None  # where those periods last over an hour: the estimate's distance from the limit, relative
 
 
@@ -52,3 +54,13 @@ class Measured:
     def distance(self) -> Complex[np.ndarray, " m"]:
         """1 + L."""
         return 1.0 + self.loop.value
+
+
+@record
+class Prediction:
+    """What the certified machines do under the reference that was played, where dry friction makes that another thing
+    at each amplitude.
+    """
+
+    figures: Mapping[str, float]  # of the design plant, by their names
+    bandwidth_hz: float  # the least of them and of those that were drawn
