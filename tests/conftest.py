@@ -16,7 +16,7 @@ from collections import defaultdict
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from types import CodeType, ModuleType, SimpleNamespace
+from types import CodeType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any, Literal, get_type_hints
 
 os.environ.setdefault("SEAOPT_CACHE_DIR", tempfile.mkdtemp(prefix="seaopt-tests-"))
@@ -58,14 +58,24 @@ checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=
 sys.modules["seaopt_type_checker"] = checker
 
 EVERY = 200
-numbers: dict[CodeType, int] = {}  # of functions: a hash of the code itself at every call takes longer than most calls
+numbers: dict[tuple[str, str, CodeType], int] = {}  # a hash of the code itself at every call takes longer than most
 calls: defaultdict[int, int] = defaultdict(int)
+made: dict[int, FunctionType] = {}  # checks of functions inside others: making one takes longer than many calls
 
 
 def make_checked(function):
     """Return a function that checks its arguments once; those that jaxtyping makes do so again with the result."""
     function.__annotations__ = {name: resolve(hint, function) for name, hint in function.__annotations__.items()}
     return checker.check(function)
+
+
+def bind(checked, function):
+    """Return the check of a function as one of another that has the same code: of one made anew inside a function."""
+    given = checked.__kwdefaults__ or {}
+    (name,) = [name for name, value in given.items() if value is checked.__wrapped__]
+    again = FunctionType(checked.__code__, checked.__globals__, closure=checked.__closure__)
+    again.__kwdefaults__ = given | {name: function}
+    return again
 
 
 def resolve(hint, function):
@@ -88,7 +98,8 @@ def check_calls(function):
         return function
     if inspect.isgeneratorfunction(function):  # checked where it is first advanced, among somebody else's shapes
         return function
-    number, checked = numbers.setdefault(function.__code__, len(numbers)), None
+    key = (function.__module__, function.__qualname__, function.__code__)  # constructors of records may have equal code
+    number, checked = numbers.setdefault(key, len(numbers)), None
 
     @functools.wraps(function)
     def call(*args, **kwargs):
@@ -97,7 +108,10 @@ def check_calls(function):
         if count > 1 and count % EVERY:
             return function(*args, **kwargs)
         if checked is None:
-            checked = make_checked(function)
+            before = made.get(number)
+            checked = make_checked(function) if before is None else bind(before, function)
+            if before is None and checked is not function and "<locals>" in function.__qualname__:
+                made[number] = checked
         with shapes_of_one_call():
             return checked(*args, **kwargs)
 
