@@ -135,9 +135,9 @@ if os.environ.get("SEAOPT_TYPES") != "0":  # long tests make calls that the quic
 
 import seaopt as so  # noqa: E402
 from seaopt.bench import PAPER_STAND  # noqa: E402
-from seaopt.estimation.judgement.hypothesis_search import Search  # noqa: E402
 from seaopt.simulation.native import find_compiler  # noqa: E402
 from tests import simulated_logs  # noqa: E402
+from tests.checks import leave_out_hypotheses  # noqa: E402
 
 settings.register_profile("seaopt", deadline=None, max_examples=25, derandomize=True)
 settings.load_profile("seaopt")
@@ -225,10 +225,15 @@ def short_log(stand, thor) -> so.Log:
 
 
 @pytest.fixture
-def without_causes(monkeypatch):
-    """Let fits look for nothing that explains a misfit better: most of such a fit's time, and no std depends on it."""
+def without_hypotheses(monkeypatch):
+    """Let fits try no part that the model may lack."""
+    leave_out_hypotheses(monkeypatch)
+
+
+@pytest.fixture
+def without_causes(monkeypatch, without_hypotheses):
+    """Let fits look for nothing that explains a misfit better, neither a part nor a wrong value."""
     monkeypatch.setattr("seaopt.estimation.judgement.judge.find_causes", lambda *_, **__: [])
-    monkeypatch.setattr("seaopt.estimation.judgement.judge.search_hypotheses", lambda *_, **__: Search())
 
 
 @pytest.fixture

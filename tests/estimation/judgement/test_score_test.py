@@ -15,6 +15,7 @@ from seaopt.estimation import diagnose
 from seaopt.estimation.judgement.score_test import run_score_tests
 from seaopt.files import to_json
 
+pytestmark = pytest.mark.usefixtures("without_hypotheses")  # which no score test reads
 NOISE = so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})
 SUM = so.Plant(
     name="sum", states={"z": "-"}, inputs={"u": "-", "v": "-"}, outputs={"y": "-"}, parameters={"a": "-", "c": "-"},
@@ -99,13 +100,3 @@ def test_a_parameter_that_nothing_stands_for_is_named_alone(swing, thor):
     assert f"f_c: {cause.text}" in found.sentences
     value, std = cause.preferred["f_c"]
     assert value == pytest.approx(30.0, abs=4 * std)
-
-
-def test_a_part_that_is_missing_is_told_whatever_parameter_is_named(thor):
-    """The screw's mode lies at 80 Hz: k or m_l take up little of it, whatever their chi-square."""
-    true = so.plants.high_impedance(parts=("screw_mode",))
-    log = so.virtual_log(true, thor, PAPER_STAND, duration_s=20, rate_hz=400, seed=3, sensors=NOISE)
-    bench = so.Experiment(plant=so.plants.high_impedance(), log=log, name="stand", outputs=("F1", "F2"))
-    found = diagnose(so.fit([bench], thor.free("J", "b_r", "eta")))
-    assert found.held["k"].chi2 > 100
-    assert any("missing pole" in sentence for sentence in found.sentences)

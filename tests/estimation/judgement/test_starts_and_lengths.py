@@ -128,6 +128,7 @@ def test_the_hold_of_a_servo_s_firmware_is_named_with_its_sample_time():
     assert best.parameters["k_s"] == pytest.approx(SERVO["k_s"], rel=0.1)
 
 
+@pytest.mark.usefixtures("without_hypotheses")
 def test_a_servo_whose_hold_is_given_has_its_elasticity():
     """Its ticks are an error that is uniform within one: what is left is as large as that."""
     fit = fit_servo(SERVO, 8.0, parts=["servo_hold"], late_s=0.0, T_h=HOLD_S)

@@ -21,6 +21,7 @@ from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.steady_state_filter import kalman_gain
 
+pytestmark = pytest.mark.usefixtures("without_causes")  # about which nothing is claimed
 PROBLEMS = Path(__file__).resolve().parents[3] / "problems"
 METHODS = {
     "output_error": so.OutputError(),
@@ -292,7 +293,6 @@ def test_soft_l1_shrugs_off_outliers(stand, thor):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("without_causes")
 def test_soft_l1_states_its_scatter_under_outliers(stand, thor):
     found, stated = [], []
     for seed in range(40):
