@@ -35,13 +35,20 @@ def take_example(header):
     return [re.sub(r" \([^()]*(\([^()]*\))?[^()]*\)$", "", line) for line in lines]
 
 
+@pytest.fixture(scope="module")
+def tuned():
+    return so.tune(STAND, THOR, SPEC)
+
+
 @pytest.mark.parametrize("kind", ["pid", "observer", "schedule", "friction", "gate"])
-def test_the_example_in_the_header_compiles_and_its_first_command_is_the_one_before(compiler, tmp_path, kind):
+def test_the_example_in_the_header_compiles_and_its_first_command_is_the_one_before(compiler, tmp_path, kind, tuned):
     if kind == "schedule":
         law = tune_schedule(STAND, THOR, SPEC, "k", [5e5, 8e5])
-    else:
+    elif kind in ("observer", "friction"):
         values = THOR.update(f_c=20.0, v_s=5e-3) if kind == "friction" else THOR
         law = so.tune(STAND, values, replace(SPEC, structure="pid_dob") if kind == "observer" else SPEC)
+    else:
+        law = tuned
     law = add_compensation(law, friction=CompensateFriction(fraction=0.5)) if kind == "friction" else law
     export(law, tmp_path, name="knee", gate=GATE if kind == "gate" else None, allow_infeasible=True)
     declare, begin, reset, step = take_example((tmp_path / "knee.h").read_text())
@@ -74,13 +81,13 @@ void write_file(const unsigned char *bytes, uint32_t count) { (void)bytes, (void
 
 
 @pytest.mark.parametrize("page", list(CALLS))
-def test_the_example_of_a_how_to_compiles_and_its_first_command_is_the_one_before(compiler, tmp_path, page):
+def test_the_example_of_a_how_to_compiles_and_its_first_command_is_the_one_before(compiler, tmp_path, page, tuned):
     name, start, after, rows = CALLS[page]
     text = (Path(__file__).parents[3] / "docs" / "howto" / page).read_text()
     (block,) = (
         block for block in re.findall(r"```c\n(.*?)```", text, re.DOTALL) if "double every_millisecond" in block
     )
-    export(so.tune(STAND, THOR, SPEC), tmp_path, name=name, log_rows=rows)
+    export(tuned, tmp_path, name=name, log_rows=rows)
     (tmp_path / "write.c").write_text(WRITE)
     main = f"""#include <stdio.h>
 {block}
@@ -122,11 +129,17 @@ int main(void)
 """
 
 
+@pytest.fixture(scope="module")
+def plan(tuned):
+    return so.bring_up(tuned, {"stand": STAND}, THOR, samples=20, fractions=(), limits={"F1": 900.0})
+
+
 @pytest.mark.parametrize("spike", [None, 1500])
-def test_a_stage_of_bring_up_is_a_program_that_starts_without_a_kick_plays_logs_and_stops(compiler, tmp_path, spike):
+def test_a_stage_of_bring_up_is_a_program_that_starts_without_a_kick_plays_logs_and_stops(
+    compiler, tmp_path, spike, tuned, plan
+):
     """On the paper's stand, discretised by scipy, its sensor off by 40 N, the current in force a sample later."""
-    law = so.tune(STAND, THOR, SPEC)
-    plan = so.bring_up(law, {"stand": STAND}, THOR, samples=20, fractions=(), limits={"F1": 900.0})
+    law = tuned
     so.machine.write_bring_up(plan, tmp_path)
     header = (tmp_path / "full" / "force_law_stage.h").read_text()
     assert f" *   I: stop it yourself beyond {plan.stages[0].stop['I']:.4g} A\n" in header and " *   F1" not in header

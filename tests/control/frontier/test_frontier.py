@@ -69,9 +69,14 @@ POINTS = [5e5, 6e5]
 OF_POINTS = so.ControllerSpec(structure="pd", max_sensitivity=1.6, max_noise_gain=25, current_limit_A=9.0)
 
 
-def test_rows_of_a_schedule_are_its_worst_places(stand, swing, thor):
+@pytest.fixture(scope="module")
+def swept(stand, swing, thor):
+    return sweep(stand, thor, OF_POINTS, [20, 60], {"swing": swing}, over="k", points=POINTS)
+
+
+def test_rows_of_a_schedule_are_its_worst_places(stand, swing, thor, swept):
     """At the points and the values that are judged between them, of the law that is tuned for that bandwidth alone."""
-    found = sweep(stand, thor, OF_POINTS, [20, 60], {"swing": swing}, over="k", points=POINTS)
+    found = swept
     assert [row.met for row in found.rows] == [True, False] and found.over == "k"
     assert "max_sensitivity" in found.rows[1].blocked_by[0]
     row, schedule = found.rows[0], found.controllers[0]
@@ -96,13 +101,12 @@ def test_rows_of_a_schedule_are_its_worst_places(stand, swing, thor):
     assert f"k = {row.ms_place:.4g}" in " ".join(repr(found).split())
 
 
-def test_a_schedule_is_swept_in_other_processes_alike(stand, thor):
-    options = {"over": "k", "points": POINTS}
-    with Processes(2) as executor:
-        apart = sweep(stand, thor, OF_POINTS, [20, 30], executor=executor, **options)
-    assert [row.to_dict() for row in apart.rows] == [
-        row.to_dict() for row in sweep(stand, thor, OF_POINTS, [20, 30], **options).rows
-    ]
+def test_a_schedule_is_swept_in_another_process_alike(stand, swing, thor, swept):
+    with Processes(1) as executor:
+        (apart,) = sweep(
+            stand, thor, OF_POINTS, [20], {"swing": swing}, executor=executor, over="k", points=POINTS
+        ).rows
+    assert apart.to_dict() == swept.rows[0].to_dict()
 
 
 @pytest.mark.slow

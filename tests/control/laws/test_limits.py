@@ -42,6 +42,11 @@ def loop(stand, thor):
 
 
 @pytest.fixture(scope="module")
+def plain(stand, thor):
+    return so.tune(stand, thor, PLAIN)
+
+
+@pytest.fixture(scope="module")
 def figures(loop):
     """Return figures that keep every limit of SPEC with room to spare."""
     return replace(
@@ -161,9 +166,9 @@ def test_what_is_left_out_has_its_default_and_false_lifts_it(figures):
     assert judge_all(none, loops(figures)[:1])[1].allowed == 1.7
 
 
-def test_filter_and_integral_are_those_of_the_law(stand, thor):
+def test_filter_and_integral_are_those_of_the_law(stand, thor, plain):
     """A law put in the place of the tuned one is judged by its own filter and integral, whatever the gains say."""
-    controller = so.tune(stand, thor, PLAIN)
+    controller = plain
     own = controller.design_loop
     assert own.filter_samples == controller.gains["T_f"] / 1e-3 and own.integral_rad_s > 0.1 * np.pi
     ahead, back = laws.multiply_out("pid", 1e-3, k_p=0.5, k_i=0.3, k_d=4e-3, T_f=2e-4, k_r=1.5)
@@ -199,10 +204,9 @@ def test_a_measurement_averaged_over_samples_keeps_the_filter_of_the_law(loop, c
 
 @pytest.mark.parametrize("structure", ["pid", "pid_dob"])
 @pytest.mark.parametrize("rate", [0.05, 0.4])
-def test_the_rate_of_the_integral_is_the_loops_slowest_pole(stand, thor, structure, rate):
+def test_the_rate_of_the_integral_is_the_loops_slowest_pole(stand, thor, plain, structure, rate):
     """Of the loop by python-control on the stand, whose static gain is 1; beside an observer it is the second."""
-    tuned = so.tune(stand, thor, replace(PLAIN, structure="pid"))
-    plant = tuned.close(stand, thor).plant
+    plant = plain.close(stand, thor).plant
     observer = DisturbanceObserver(nominal=Nominal.of(plant), T_q=8e-3) if structure == "pid_dob" else None
     gains = Gains(k_p=0.4, k_i=1.4 * rate, k_d=2e-3, T_f=2e-3, k_r=1.4, observer=observer)
     law = gains.law(structure, 1e-3)
@@ -212,8 +216,8 @@ def test_the_rate_of_the_integral_is_the_loops_slowest_pole(stand, thor, structu
     poles = np.log(control.feedback(late * c_y, 1).poles()) / 1e-3
     slowest = float(np.min(np.abs(poles)))
     assert find_integral_rate(law) == pytest.approx(slowest, rel=2e-3 + 0.05 * rate)
-    made = replace(tuned, law=law, gains=gains.by_name(), observer=observer, spec=replace(PLAIN, structure=structure))
-    broken = list_broken(judge_all(PLAIN, [replace(made, structure=structure).measure("stand", tuned.achieved)]))
+    made = replace(plain, law=law, gains=gains.by_name(), observer=observer, spec=replace(PLAIN, structure=structure))
+    broken = list_broken(judge_all(PLAIN, [replace(made, structure=structure).measure("stand", plain.achieved)]))
     assert ("integral_rad_s" in broken) == (rate < 0.1 * np.pi)
 
 

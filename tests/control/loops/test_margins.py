@@ -129,6 +129,14 @@ def test_a_gain_margin_downwards():
     assert loop.figures().gain_margin_db == pytest.approx(min(found.gain_up_db, -found.gain_down_db))
 
 
+@cache
+def tune_integrating(structure, bandwidth_hz, ms):
+    spec = so.ControllerSpec(
+        bandwidth_hz=bandwidth_hz, max_sensitivity=ms, structure=structure, reference_weights="error"
+    )
+    return so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
+
+
 @pytest.mark.parametrize(
     ("name", "structure", "bandwidth_hz", "ms"),
     [("stand", *law) for law in INTEGRATING]
@@ -136,10 +144,7 @@ def test_a_gain_margin_downwards():
 )
 def test_an_integrator_is_no_crossing(structure, bandwidth_hz, ms, name, request, thor):
     """-1/L at 0 Hz was rounding over infinity: 1.5e-7 to 1.5e-8 of pid_dob on the stand, up to 1.6e-4 on the swing."""
-    spec = so.ControllerSpec(
-        bandwidth_hz=bandwidth_hz, max_sensitivity=ms, structure=structure, reference_weights="error"
-    )
-    loop = so.tune(so.plants.high_impedance(), thor, spec).close(request.getfixturevalue(name), thor)
+    loop = tune_integrating(structure, bandwidth_hz, ms).close(request.getfixturevalue(name), thor)
     found = margins(loop)
     assert found.gain_down_db is None
     assert found.gain_up_db == pytest.approx(loop.figures().gain_margin_db)

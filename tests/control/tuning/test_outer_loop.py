@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from types import SimpleNamespace
 
 import casadi as ca
@@ -17,7 +17,7 @@ import seaopt as so
 from seaopt.control import Impedance, add_impedance, critical_impedance, sweep, tune_schedule
 from seaopt.control.laws.command import command_of
 from seaopt.control.running.fed_back import close_whole, split_states
-from seaopt.control.tuning import interior_point
+from seaopt.control.tuning import interior_point, possible_bandwidths
 from seaopt.control.tuning.convex_concave import linearise_law
 from seaopt.control.tuning.found_law import meet_outer
 from seaopt.control.tuning.frequencies import make_grid
@@ -119,9 +119,15 @@ def describe_case(name: str):
     return moving, command, -1.0 if linear else 1.0, v["L_a"] ** -2 if linear else 1.0
 
 
+@cache
+def tune_force(*, linear: bool = False):
+    """Return a force law of the actuator alone."""
+    return so.tune(STAND, THOR, so.ControllerSpec(bandwidth_hz=20)) if linear else so.tune(HELD, VALUES, OF_KNEE)
+
+
 def surround(name: str, around: Impedance, task: Task) -> Task:
     linear = name.startswith("swing")
-    force = so.tune(STAND, THOR, so.ControllerSpec(bandwidth_hz=20)) if linear else so.tune(HELD, VALUES, OF_KNEE)
+    force = tune_force(linear=linear)
     whole = add_impedance(force, *((SWING, THOR) if linear else (KNEE, VALUES)), around)
     return task.enclosed(whole.outer, force.command.per_effort)
 
@@ -137,11 +143,11 @@ def draw_numbers(task, rng):
 
 @pytest.mark.parametrize("name", ["knee", "late", "cascade", "swing", "swing_dob"])
 def test_curves_figures_and_stability_are_those_of_the_loop_by_hand(name):
-    """Of 70 random laws and impedances each."""
+    """Of 40 random laws and impedances each."""
     rng, plain, f = np.random.default_rng(5), make_case(name), np.geomspace(0.02, 495.0, 300)
     moving, command, sigma, unit = describe_case(name)
     stable = 0
-    for number in range(70):
+    for number in range(40):
         size = unit * (1.0 if number % 2 else 0.3)
         around = Impedance(
             stiffness=size * rng.uniform(0.0, 150.0), damping=size * rng.uniform(-1.0, 8.0), velocity_filter_s=T_V
@@ -163,7 +169,7 @@ def test_curves_figures_and_stability_are_those_of_the_loop_by_hand(name):
             stable += 1
             found = loop.figures()
             assert (found.ms, found.mt) == pytest.approx(find_ms_and_mt(hand), rel=1e-4)
-    assert stable >= 12, stable
+    assert stable >= 7, stable
     np.testing.assert_allclose(respond(hand, z), hand(z), rtol=1e-8)  # python-control's own way
 
 
@@ -230,7 +236,7 @@ def test_what_is_asked_of_the_design_plant_alone_is_asked_of_the_force_law():
     values = VALUES.update(m=6.0)
     spec = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_droop_db=False, max_reference_peak=False)
     task = make_task(KNEE, values, replace(spec, max_noise_gain=40.0), {})
-    force = so.tune(HELD, VALUES, OF_KNEE)
+    force = tune_force()
     around = add_impedance(force, KNEE, values, replace(ASKED, stiffness=30.0, damping=2.0)).outer
     closed, x = (
         task.enclosed(around, force.command.per_effort),
@@ -250,16 +256,15 @@ def test_what_is_asked_of_the_design_plant_alone_is_asked_of_the_force_law():
     assert abs(loop.figures.mt - force_alone.figures.mt) > 0.01
 
 
+@cache
 def tune_knee(around, spec=OF_KNEE):
-    """Return a law tuned with the impedance, and that with it which was tuned without."""
-    complete = partial(give_outer, around)
-    with_it = so.tune(HELD, VALUES, spec, {"knee": KNEE}, outer=lambda law: complete(law).outer)
-    return with_it, complete(tune_alone(spec))
+    """Return a law tuned with the impedance."""
+    return so.tune(HELD, VALUES, spec, {"knee": KNEE}, outer=lambda law: give_outer(around, law).outer)
 
 
 @cache
-def tune_alone(spec):
-    return so.tune(HELD, VALUES, spec, {"knee": KNEE})
+def tune_alone():
+    return so.tune(HELD, VALUES, OF_KNEE, {"knee": KNEE})
 
 
 def give_outer(around, law):
@@ -286,12 +291,14 @@ def measure_by_hand(law, around):
     ],
 )
 def test_a_law_keeps_its_limits_with_the_outer_loop(around, spec):
-    """Which the one tuned without does not; of critical damping the loop has its double pole."""
-    law, without = tune_knee(around, spec)
+    """Which a pid tuned without does not; of critical damping the loop has its double pole."""
+    law = tune_knee(around, spec)
     assert law.met and law.outer is not None and give_outer(around, law).outer == law.outer
     if spec.drive_delay_s is None:
         ms, mt = measure_by_hand(law, law.outer.impedance)
         assert ms <= 1.6 * (1 + 1e-4) and mt <= 1.3 * (1 + 1e-4)
+    if spec is OF_KNEE:
+        without = give_outer(around, tune_alone())
         assert max(measure_by_hand(without, without.outer.impedance)) > 1.3
     figures = close_whole(law, *place(law, KNEE)).figures()
     assert figures.ms <= 1.6 * (1 + 2e-6) and figures.mt <= 1.3 * (1 + 2e-6)
@@ -305,17 +312,17 @@ def place(law, plant):
 
 
 def test_a_law_that_keeps_its_limits_with_the_outer_loop_is_left_as_it_is():
-    law, without = tune_knee(replace(ASKED, stiffness=40.0, damping=2.0))
-    assert law.met and law.gains == without.gains
+    law = tune_knee(replace(ASKED, stiffness=40.0, damping=2.0))
+    assert law.met and law.gains == tune_alone().gains
 
 
 def test_what_cannot_be_met_is_said_with_what_can():
     """Too little damping: the force loop alone would keep every limit. The bandwidth advised does keep them."""
     loose = replace(ASKED, stiffness=80.0, damping=1.0)
-    law, without = tune_knee(loose)
-    assert without.met and not law.met and "max_complementary" in law.explanation and law.possible is not None
+    law = tune_knee(loose)
+    assert tune_alone().met and not law.met and "max_complementary" in law.explanation and law.possible is not None
     (nearest, *_) = law.possible.nearest_hz
-    faster, _ = tune_knee(loose, replace(OF_KNEE, bandwidth_hz=float(f"{nearest:.4g}")))
+    faster = tune_knee(loose, replace(OF_KNEE, bandwidth_hz=float(f"{nearest:.4g}")))
     assert faster.met
     assert max(measure_by_hand(faster, loose)) <= 1.6 * (1 + 1e-4)
 
@@ -324,7 +331,7 @@ def test_a_damping_at_a_link_that_nothing_holds_leaves_its_drift_out():
     """By hand an eigenvalue of 1, of where the link is, which no margin depends on."""
     loose = replace(ASKED, stiffness=0.0, damping=2.0)
     plants = {"free": FREE}
-    force = so.tune(HELD, VALUES, OF_KNEE)
+    force = tune_force()
     law = add_impedance(force, FREE, VALUES, loose)
     (shown,) = split_states(law, plants, VALUES).values()
     moving, command, sigma, _ = describe_case("knee")
@@ -363,16 +370,16 @@ def test_a_sweep_is_of_laws_with_their_outer_loop():
     ms, mt = measure_by_hand(law, ASKED)
     assert ms <= 1.6 * (1 + 1e-4) and mt <= 1.3 * (1 + 1e-4)
     assert row.ms == pytest.approx(max(ms, law.close(HELD, VALUES).figures().ms), rel=1e-3)
-    alone, _ = tune_knee(ASKED)
-    assert law.gains == pytest.approx(alone.gains, rel=1e-2)
+    assert law.gains == pytest.approx(tune_knee(ASKED).gains, rel=1e-2)
 
 
-def test_an_outer_loop_that_is_refused_is_an_error():
+def test_an_outer_loop_that_is_refused_is_an_error(monkeypatch):
     def refuse(_):
         raise ControlError("no critically damped impedance")
 
     with pytest.raises(ControlError, match="critically"):
         so.tune(HELD, VALUES, OF_KNEE, {"knee": KNEE}, outer=refuse)
+    monkeypatch.setattr(possible_bandwidths, "FARTHEST_BELOW", 1.01)  # what else could be had is another test's
     law = so.tune(HELD, VALUES, replace(OF_KNEE, max_noise_gain=1.0), {"knee": KNEE}, outer=refuse)
     assert not law.met and law.outer is None
 
