@@ -220,8 +220,9 @@ def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(t
     assert "bandwidth, stuck" in repr(law) and "bandwidth, sliding" in repr(law)
 
 
-def test_what_cannot_be_played_is_refused(controller):
+def test_what_cannot_be_played_is_refused(controller, plan):
     options = {"plants": {"stand": so.plants.high_impedance()}, "uncertainty": so.plants.thor(), "samples": 5}
+    options["certificate"] = plan.stages[-1].certificate
     for wrong, says in (
         ({"fractions": (1.5,)}, "between 0 and 1"),
         ({"share": 0.0}, "share = 0"),
