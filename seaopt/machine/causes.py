@@ -252,8 +252,8 @@ def _list_factors(setting: Setting) -> Iterator[Alternative]:
     ):
         factor = fitted.get(what)
         usual = [-1.0, *UNITS] if factor is None else [factor]
-        for each in dict.fromkeys([-1.0, *usual]):
-            kind, value = name_factor(what, each, setting.controller.signals)
+        signals = setting.controller.signals
+        for kind, value in dict.fromkeys(name_factor(what, each, signals) for each in [-1.0, *usual]):
             yield Alternative(
                 kind=kind,
                 what=what,

@@ -81,6 +81,8 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
             return _describe_lines(whole, lines, ticks_per_row)
         if first is not None and first.kind == "late" and first.what == "command" and first.explains:
             late, causes, match = int(first.value or 0), (), play(changed)
+        elif first is not None and first.explains and play(replace(changed, rounded=False)).met:
+            match = play(replace(whole, rounded=False))  # what is read in coarse steps is counts
         elif (first is None or not first.explains) and (names := find_unfollowed(whole, match)):
             what = join_words(names)
             causes = (Cause(kind="open loop", what=what, value=None, unit="", removes=1.0, explains=True),)

@@ -114,6 +114,18 @@ def test_a_fault_that_rounding_would_hide_is_named_where_it_leaves_nothing(contr
     assert (cause.kind, cause.what) == ("factor", "I") and np.isclose(cause.value, 1.015, rtol=1e-6)
 
 
+def test_counts_of_another_law_are_no_rounding_either(controller, bench):
+    log = bench.log(replace(Machine(), force_step=COARSE), REFERENCE)
+    (row,) = so.accept(controller, [rename(log, I=0.5 * log["I"])]).replays
+    assert row.causes[0].explains and row.allowed < 0.01 * row.rms
+
+
+def test_a_sign_is_listed_once(controller, bench):
+    (row,) = so.accept(controller, [bench.log(replace(Machine(), reading_sign=-1.0), REFERENCE)]).replays
+    causes = [(cause.kind, cause.what, cause.value) for cause in row.causes]
+    assert ("sign", "F1", -1.0) in causes and len(set(causes)) == len(causes)
+
+
 def test_readings_that_a_log_rounds_are_still_allowed_for(controller, bench):
     log = bench.log(Machine(), REFERENCE)
     (row,) = so.accept(controller, [rename(log, F1=COARSE * np.round(log["F1"] / COARSE))]).replays
