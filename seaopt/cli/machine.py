@@ -23,9 +23,9 @@ from seaopt.files import read_json, to_json, write_json, write_text
 from seaopt.logs import write_log
 from seaopt.machine import Acceptance, BringUp, Stage, accept, bring_up
 from seaopt.machine.acceptance import take_ranges
-from seaopt.machine.bringup import BRINGUP_SCHEMA, FULL, OF_A_STAGE, slow_down
-from seaopt.machine.bringup_files import write_stage
-from seaopt.machine.bringup_page import write_bring_up_page
+from seaopt.machine.bringup.files import write_stage
+from seaopt.machine.bringup.page import write_bring_up_page
+from seaopt.machine.bringup.stages import BRINGUP_SCHEMA, FULL, OF_A_STAGE, slow_down
 from seaopt.machine.page import write_acceptance_page
 from seaopt.machine.response.periods import Played
 from seaopt.machine.stepped import Source

@@ -10,8 +10,8 @@ import pytest
 
 import seaopt as so
 from seaopt.formatting import format_number
-from seaopt.machine.bringup_files import write_bring_up
-from seaopt.machine.excitation import design_excitation
+from seaopt.machine.bringup.excitation import design_excitation
+from seaopt.machine.bringup.files import write_bring_up
 from tests.machine.simulator import Bench, Machine
 
 SHARE = 0.4
@@ -193,7 +193,7 @@ def test_a_stage_moves_the_motor_against_its_friction_or_says_that_it_does_not(
 
 def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(tmp_path):
     """The stuck plant is that of the equations: a motor that does not move behind its spring, but for v_s."""
-    from seaopt.machine.bringup_page import write_bring_up_page
+    from seaopt.machine.bringup.page import write_bring_up_page
     from seaopt.reporting import write_report
 
     values = so.plants.thor().update(f_c=60.0, v_s=5e-3)
@@ -272,7 +272,7 @@ def test_expected_peaks_contain_the_noise_of_what_is_read(controller, compiler, 
 def test_with_dry_friction_the_page_does_not_ask_that_logs_lie_in_the_band_of_the_sliding_machine(
     plan, controller, tmp_path
 ):
-    from seaopt.machine.bringup_page import write_bring_up_page
+    from seaopt.machine.bringup.page import write_bring_up_page
 
     stand, values = so.plants.high_impedance(), so.plants.thor().update(f_c=60.0, v_s=5e-3)
     law = so.tune(stand, values, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))

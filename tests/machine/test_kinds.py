@@ -136,7 +136,7 @@ def refuse(fraction):
 
 
 def test_a_schedule_is_brought_up_with_less_effort_then_at_each_point(schedule, compiler, tmp_path):
-    from seaopt.machine.bringup_files import write_bring_up
+    from seaopt.machine.bringup.files import write_bring_up
 
     certified = []
 
@@ -162,7 +162,7 @@ def test_a_schedule_is_brought_up_with_less_effort_then_at_each_point(schedule, 
 
 @pytest.mark.slow
 def test_predictive_control_is_brought_up_with_less_effort(planned, tmp_path):
-    from seaopt.machine.bringup_files import write_bring_up
+    from seaopt.machine.bringup.files import write_bring_up
     from seaopt.robustness import linear_controller
 
     mpc = planned.controller

@@ -9,7 +9,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import Gains, runnable
-from seaopt.machine.excitation import design_excitation
+from seaopt.machine.bringup.excitation import design_excitation
 from seaopt.machine.stepped import find_modes
 from tests.machine.conftest import SPEC
 from tests.machine.simulator import Bench, Machine, multisine

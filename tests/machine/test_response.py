@@ -10,8 +10,8 @@ import pytest
 import scipy.stats
 
 import seaopt as so
+from seaopt.machine.bringup.excitation import design_excitation
 from seaopt.machine.design_run import run_design
-from seaopt.machine.excitation import design_excitation
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import LeftOut, cut_periods, find_period, join_blocks

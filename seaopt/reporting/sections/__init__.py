@@ -36,7 +36,7 @@ KINDS = {
     "Drift": "seaopt.fleet.page",
     "Population": "seaopt.fleet.page",
     "Acceptance": "seaopt.machine.page",
-    "BringUp": "seaopt.machine.bringup_page",
+    "BringUp": "seaopt.machine.bringup.page",
 }
 
 

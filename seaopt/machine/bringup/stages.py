@@ -16,8 +16,8 @@ from seaopt.control.running.closed_loop import LoopRun
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
+from seaopt.machine.bringup.excitation import Excitation, design_excitation
 from seaopt.machine.design_run import run_design
-from seaopt.machine.excitation import Excitation, design_excitation
 from seaopt.machine.response.verdicts import LEAST_PHASES, AgainstFriction, find_friction, has_dry_friction
 from seaopt.machine.stepped import Source, stand
 from seaopt.parameters import ParameterSet

@@ -10,7 +10,7 @@ import numpy as np
 
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.formatting import format_count, format_number, join_words
-from seaopt.machine.bringup import Band, BringUp, Stage
+from seaopt.machine.bringup.stages import Band, BringUp, Stage
 from seaopt.machine.response.verdicts import find_friction, has_dry_friction
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
 from seaopt.reporting.page.chart import make_chart

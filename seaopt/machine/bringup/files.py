@@ -12,7 +12,7 @@ from seaopt.control.deploy.target import LOG_ROWS, Tare
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
-from seaopt.machine.bringup import Band, BringUp, Stage
+from seaopt.machine.bringup.stages import Band, BringUp, Stage
 
 PER_LINE = 8
 HEADER = """/* The reference of a stage of bring-up, made by seaopt: {phases} set(s) of phases, a period of
