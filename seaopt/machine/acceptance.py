@@ -21,7 +21,7 @@ from seaopt.logs import Log
 from seaopt.machine.causes import Cause
 from seaopt.machine.decimated import shift_command
 from seaopt.machine.differences.certified import Differences, compare
-from seaopt.machine.replay import Replay, replay
+from seaopt.machine.replay import Replay, replay, replay_stretches
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, find_refused, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Source, stand
@@ -214,6 +214,9 @@ def accept(
                 (before,) = list_ticks(controller, [log], reference, at, before=True)
                 tried.append((before, replay(controller, before, others)))
         chosen, row = max(tried, key=lambda pair: (pair[1].met, pair[1].explained, pair[1].undecided))
+        if chosen.gaps is not None and chosen.rendered is None and row.met and row.ticks_per_row == 1:
+            (whole,) = list_ticks(controller, [log], reference, at, whole=True)
+            row = replay_stretches(controller, row, chosen, whole, others or {})
         rows.append(chosen)
         replays.append(_check_header(controller, log, row, others or {}))
     law = stand(controller, rows[0].middle)

@@ -515,7 +515,9 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     if result.replayed:
         remarks += (_say_reach(result),)
     remarks += tuple(
-        _say_gaps(Path(source).name, gaps) for source, gaps in zip(result.sources, result.gaps, strict=True) if gaps
+        _say_gaps(Path(source).name, gaps, row)
+        for source, gaps, row in zip(result.sources, result.gaps, result.replays, strict=True)
+        if gaps
     )
     remarks += tuple(
         f"{Path(source).name} does not exclude that {', or that '.join(map(say_cause, row.possible))}."
@@ -569,16 +571,19 @@ def _say_reach(result: Acceptance) -> str:
     )
 
 
-def _say_gaps(name: str, gaps: Gaps) -> str:
+def _say_gaps(name: str, gaps: Gaps, row: Replay) -> str:
     """Return what a log lacks, and what to do about it."""
     lacks = [f"no row of {format_count(gaps.ticks, 'tick')}"] if gaps.ticks else []
     lacks += [f"{format_count(gaps.rows, 'row')} with a number missing"] if gaps.rows else []
     places = f"in {format_count(gaps.count, 'place')}, the first after {format_number(gaps.first_s, 3)} s"
+    replayed = f"its longest stretch without, of {format_count(gaps.longest, 'tick')}"
+    if row.stretches > 1:
+        each = "each from a state that its own first rows tell"
+        replayed = f"{row.stretches} stretches without, of {format_count(row.ticks, 'tick')} in all, {each}"
     return (
-        f"{name} has {join_words(lacks)} by its clock, {places}: the law is replayed on its longest stretch without, "
-        f"of {format_count(gaps.longest, 'tick')}, and each period that misses a row is left out of the response. Log "
-        "every tick; where none is lost and the stamps alone leap, leave the time column out of the log and state "
-        "[acceptance] rate_hz in the problem file."
+        f"{name} has {join_words(lacks)} by its clock, {places}: the law is replayed on {replayed}, and each period "
+        "that misses a row is left out of the response. Log every tick; where none is lost and the stamps alone leap, "
+        "leave the time column out of the log and state [acceptance] rate_hz in the problem file."
     )
 
 

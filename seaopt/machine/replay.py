@@ -48,6 +48,7 @@ class Replay:
     command_most: float = 0.0  # command_most, command_mostly: as in `Ticks`, of the logged command
     command_mostly: float = 0.0
     possible: tuple[Cause, ...] = ()  # of a log with every n-th tick: laws with other parts that it does not exclude
+    stretches: int = 1  # between its gaps
 
     @property
     def explained(self) -> bool:
@@ -111,6 +112,37 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
         rate_hz=rate_hz,
         law_rate_hz=law_rate_hz,
         causes=causes,
+    )
+
+
+def replay_stretches(
+    source: Source, row: Replay, longest: Ticks, whole: Ticks, others: Mapping[str, Controller]
+) -> Replay:
+    """Return the replay of all stretches of a log with gaps, the longest of which is of the law, as `row` has it.
+
+    Each begins in a state that the log does not have, and that its own first rows tell, as at the start of a log; what
+    a stretch of few rows says is therefore less than what it would as a part of a longer one. Rounding, and what is as
+    good as nothing, are those of the longest.
+    """
+    stretches = whole.move_command(row.command_late).split()
+    matches = list[Match]()
+    for ticks in stretches:
+        setting = replace(make_setting(source, ticks), log=longest)
+        match = play(setting)
+        if not match.met:
+            causes, _ = find_causes(setting, match, others)
+            worst = float(np.max(np.abs(match.error)))
+            return replace(row, met=False, mismatch=math.sqrt(match.energy), largest=worst, causes=causes)
+        matches.append(match)
+    if not matches:
+        return row
+    errors = np.concatenate([match.error for match in matches])
+    return replace(
+        row,
+        ticks=errors.size,
+        stretches=len(matches),
+        mismatch=math.sqrt(float(np.mean(errors**2))),
+        largest=float(np.max(np.abs(errors))),
     )
 
 

@@ -68,6 +68,7 @@ class Setting:
     law: RunnableLaw | RunnableSchedule | ForceMPC
     ticks: Ticks
     rounded: bool = True  # whether the law may have seen finer readings than are logged
+    log: Ticks | None = None  # by which rounding and the command's size are judged, of few ticks of a longer log
 
     @property
     def linear(self) -> RunnableLaw:
@@ -219,8 +220,9 @@ def play(setting: Setting) -> Match:
     """Return the commands of a setting's law on its log."""
     ticks, linear = setting.ticks, setting.linear
     head = ticks.take(slice(0, count_head(linear)))
-    allowed, allowed_within = _allow(linear, ticks, rounded=setting.rounded)
-    allowed_head, floor = allowed[: len(head)], FLOOR * float(np.std(ticks.command))
+    log = setting.log or ticks
+    allowed, allowed_within = _allow(linear, ticks, log, rounded=setting.rounded)
+    allowed_head, floor = allowed[: len(head)], FLOOR * float(np.std(log.command))
     # A start that is nearly right drifts in the integrals: what the floor allows is not taken for rounding.
     exact = float(np.mean(allowed_head**2)) - (1.0 - EXACT**2) * floor**2
     best: tuple[State, int] | None = None
@@ -332,7 +334,7 @@ def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, "
     return np.linalg.lstsq(modes, left[~limited] * weight, rcond=1e-10)[0]
 
 
-def _allow(law: RunnableLaw, ticks: Ticks, *, rounded: bool) -> tuple[Float[np.ndarray, " n"], float]:
+def _allow(law: RunnableLaw, ticks: Ticks, log: Ticks, *, rounded: bool) -> tuple[Float[np.ndarray, " n"], float]:
     """Return one std of what rounding allows at each row, of the command and of what the law saw if that is `rounded`
     in the log, and its rms within stretches.
     """
@@ -341,14 +343,14 @@ def _allow(law: RunnableLaw, ticks: Ticks, *, rounded: bool) -> tuple[Float[np.n
     n, integrals = len(ticks), count_integrals(law)
     response = find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
     steps: list[Any] = []
-    if np.unique(ticks.reference).size >= LEVELS:
-        steps.append((law.b_reference, law.d_reference, ticks.reference))
+    if np.unique(log.reference).size >= LEVELS:
+        steps.append((law.b_reference, law.d_reference, ticks.reference, log.reference))
     columns = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
-    steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i]) for i in range(law.measured)]
-    variance = np.full(n, ticks.quantum**2 / 12.0 + (FLOOR * float(np.std(ticks.command))) ** 2)
+    steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i], log.measured[:, i]) for i in range(law.measured)]
+    variance = np.full(n, log.quantum**2 / 12.0 + (FLOOR * float(np.std(log.command))) ** 2)
     within = float(variance[0])
-    for b, d, values in steps if rounded else ():
-        each = find_quantisation(values) ** 2 / 12.0
+    for b, d, values, logged in steps if rounded else ():
+        each = find_quantisation(logged) ** 2 / 12.0
         if each:
             impulse = np.concatenate([[law.per_effort * d], response @ b])
             within += each * float(np.mean(np.cumsum(impulse**2)))

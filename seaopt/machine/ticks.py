@@ -64,6 +64,11 @@ class Ticks:
         parts = (self.reference[:, None], self.command[:, None], self.measured, self.further)
         return np.all(np.isfinite(np.column_stack(parts)), axis=1)
 
+    def split(self) -> list[Ticks]:
+        """Return the stretches that have all numbers, but for those that are too short for a replay."""
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], self.complete, [False]]).astype(int)))
+        return [self.take(slice(start, stop)) for start, stop in edges.reshape(-1, 2) if stop - start >= FEWEST]
+
     def take(self, rows: Any, *, command: slice | None = None, measured: slice | None = None) -> Ticks:
         """Return some rows, a slice or numbers; with the command, or the readings, of other rows."""
         read = rows if measured is None else measured

@@ -141,3 +141,33 @@ def test_a_log_that_is_shorter_than_its_periods_is_told_so_and_how_long_to_recor
     assert "12 s" in text and "three after it, 4 s" in text
     unknown = so.accept(controller, [log]).left_out["bench"]
     assert "the log is shorter than two of them" in unknown and "at least 3 periods" in unknown
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("decimals", [None, 2])
+def test_all_stretches_of_a_right_law_are_replayed_however_short(controller, bench, seed, decimals):
+    whole = bench.log(Machine(), REFERENCE, seed=seed, decimals=decimals)
+    log = lose(whole, np.unique(np.random.default_rng(seed).integers(1, 9999, 100)))
+    (row,) = so.accept(controller, [log]).replays
+    lengths = [segment.stop - segment.start for segment in log.segments]
+    taken = [length for length in lengths if length >= 50]
+    assert row.met and row.stretches == len(taken) and row.ticks == sum(taken) > 0.8 * len(log)
+    assert row.mismatch < 2e-3 * row.rms
+
+
+def test_a_stretch_of_another_law_beside_a_longer_one_of_this_is_found_and_named(controller, bench, tmp_path):
+    log = lose(bench.log(Machine(), REFERENCE), [2000, 3000])
+    command = log["I"].copy()
+    command[:2000] *= 0.5
+    columns = {name: log[name] for name in ("reference", "F1")}
+    result = so.accept(controller, [so.Log.from_arrays(time=log.time, source="bench", I=command, **columns)])
+    (row,) = result.replays
+    assert not row.met and (row.causes[0].kind, row.causes[0].what, row.causes[0].explains) == ("factor", "I", True)
+    assert row.causes[0].value == pytest.approx(0.5, rel=1e-6) and result.response is None
+
+
+def test_stretches_are_said_with_how_their_states_are_found(controller, bench, tmp_path):
+    result = so.accept(controller, [lose(bench.log(Machine(), REFERENCE), [2500, 5100])])
+    terminal, page, record = read_everywhere(result, tmp_path)
+    says = "3 stretches without, of 9998 ticks in all, each from a state that its own first rows tell"
+    assert says in terminal and says in page and record["replay"]["logs"][0]["stretches"] == 3
