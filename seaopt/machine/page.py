@@ -9,15 +9,15 @@ from pathlib import Path
 from seaopt.control import Controller
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import EXPLAINED, Acceptance
-from seaopt.machine.causes import Cause
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.figures import list_panels
-from seaopt.machine.free_gains import SAME_GAINS, read_gains
+from seaopt.machine.free_gains import read_gains
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, SHORT_BY, Judged, Measured, Response
 from seaopt.machine.ticks import AT_LIMIT, Gaps
+from seaopt.machine.wording import say_cause, say_difference
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -59,19 +59,6 @@ NO_GAINS = (
 ONE_BY_ONE = (
     "Each line by itself is within reach of some certified machine, but none of them explains all lines together."
 )
-EVERY_TICK = "of a log with every n-th tick"
-OPEN = {
-    "terms": "terms of the law (friction, gravity, ripple) are not linear; log every tick",
-    "outer": "the outer loop runs between the rows, too; log every tick",
-    "moving": "the schedule's variable moves; hold it at a value, or log every tick",
-    "periods": "its reference has to repeat, a whole number of rows each time, three times at least and with the "
-    "command below its limit; play such a one, or log every tick",
-    "saturated": "the command is at its limit in most rows, where all laws look alike; check signs and units, and "
-    "lower the amplitude",
-    "phases": "dry friction folds into its lines; play six sets of random phases, or log every tick",
-    "aliases": "lines of the reference above half of the log's rate come back as others; play slower ones, or log "
-    "every tick",
-}
 RATE = (
     "These figures are in the machine's seconds: the law is stepped at {} times the rate that the log's clock says, "
     "and all that is read off that clock is wrong."
@@ -119,121 +106,6 @@ HIDDEN = (
     "of the rounding of the whole log by {} std."
 )
 AND = "with the first one also: "
-UNTOLD = {
-    "short, gain": "a law whose {} is half as large",
-    "short, factor": "a {} that is halved",
-    "short, late": "a {} of one tick later",
-}
-
-
-def _say_open(cause: Cause) -> str:
-    """Return why a log does not tell which law it is of, and what would."""
-    if cause.kind in OPEN:
-        return f"undecided, {EVERY_TICK}: {OPEN[cause.kind]}"
-    if cause.kind == "rounding":
-        value = format_number(cause.value)
-        return f"undecided: rounding of the log allows {value} (rms) of the command; log it with more digits"
-    other = UNTOLD[cause.kind].format("reading" if cause.what == "readings" else cause.what)
-    more = (
-        "no length of this reference would decide: play lines where that acts, or log every tick"
-        if cause.value is None
-        else f"{format_number(cause.value, 2)} s of this reference would decide"
-    )
-    return f"undecided: the log cannot tell this law from {other}; {more}"
-
-
-def say_cause(cause: Cause) -> str:
-    """Return what a cause means for who wrote the firmware."""
-    if cause.undecided:
-        return _say_open(cause)
-    value = format_number(cause.value)
-    match cause.kind:
-        case "rate" if cause.what == "clock":
-            return f"the law is stepped at {value} Hz by the log's clock"
-        case "rate" if cause.what == "law":
-            return f"the law is stepped only every few rows, at {value} Hz"
-        case "rate":
-            return f"the numbers are those of a law made for {value} Hz"
-        case "late":
-            return f"the {cause.what} {'comes' if cause.what == 'command' else 'come'} {value} {cause.unit} late"
-        case "sign":
-            return f"the sign of {cause.what} is turned"
-        case "open loop":
-            return (
-                f"the command does not follow {cause.what}: the loop was open; let the law make the command in each "
-                "tick of what was read, and record under a reference that moves"
-            )
-        case "unit":
-            return f"{cause.what} is in another unit: {value} times what it should be"
-        case "factor":
-            return f"{cause.what} is {value} times what it should be"
-        case "gain":
-            return f"the gain {cause.what} is {value}"
-        case "limit" if cause.what == "behind the law":
-            return f"the command is limited to {value}{unit_after(cause.unit)} behind the law, which is not told of it"
-        case "limit":
-            return f"the command is limited to {value}{unit_after(cause.unit)}"
-        case "feedforward":
-            return f"the feedforward of the {cause.what} is missing or another one"
-        case "place":
-            return f"the law was given {value}{unit_after(cause.unit)} as {cause.what}"
-        case "compensation":
-            return f"the compensation of {cause.what} is missing"
-        case "part":
-            return f"the {cause.what} is missing"
-        case "gains":
-            return _say_gains(cause)
-        case "another law":
-            return f"it is the law of {cause.what}"
-        case _:
-            return f"the {cause.kind} is {cause.what}"
-
-
-def _say_gains(cause: Cause) -> str:
-    """Return which gains a law has that are not the exported ones, the most different first."""
-    found, exported = cause.gains or {}, cause.exported or {}
-    apart = {name: abs(found[name] - value) / max(abs(found[name]), abs(value)) for name, value in exported.items()}
-    named = [name for name in sorted(apart, key=lambda name: -apart[name]) if apart[name] > SAME_GAINS]
-    values = [f"{name} {format_number(found[name])} ({format_number(exported[name])} exported)" for name in named]
-    whose = "" if cause.what == "law" else f", those of {cause.what}"
-    return f"it is a law with another set of gains{whose}: {', '.join(values)}"
-
-
-def say_difference(each: Difference) -> str:
-    """Return a difference in words; of two that explain it together both."""
-    return ", and ".join(map(_say_part, (each, *each.beside)))
-
-
-def _say_part(each: Difference) -> str:
-    others = [f"{name} {format_number(value, 3)}" for name, value in zip(each.alike, each.alike_values, strict=True)]
-    also = f" (or {', or '.join(others)})" if others else ""
-    match each.kind:
-        case "range":
-            return (
-                f"{each.name} stops at {format_number(each.value)}{unit_after(each.unit)}: its sensor is at its range"
-            )
-        case "delay":
-            way = "later" if each.value > 0.0 else "earlier"
-            return f"the loop is {abs(1e3 * each.value):.3g} ms {way} than certified"
-        case "mode":
-            pole = "" if each.size is None else f", its pole at {format_number(each.value / each.size, 3)} Hz"
-            size = (
-                "" if each.changes is None else f", which changes the response {format_number(each.changes, 2)} times"
-            )
-            return f"there is a mode at {format_number(each.value, 3)} Hz{pole}{size}"
-        case "drive limit":
-            level = f"{format_number(each.value, 3)}{unit_after(each.unit)}"
-            return f"the drive gives at most {level} of what is commanded"
-        case "rate":
-            return (
-                f"the law is stepped at {format_number(each.value)} Hz by what the machine does, "
-                f"{format_number(each.size, 3)} times the rate of the log's clock; check the timer that calls it"
-            )
-        case "gain":
-            turned = "the sign of the drive is turned; " if each.value < 0.0 else ""
-            return f"{turned}the force per command is {format_number(each.value, 3)} times the certified one{also}"
-        case _:
-            return f"{each.name} is {format_number(each.value, 3)} times its value{also}"
 
 
 def judge(result: Acceptance, commands: Commands) -> Verdict | None:

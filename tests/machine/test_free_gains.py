@@ -10,7 +10,7 @@ import pytest
 import seaopt as so
 from seaopt.control import Gains
 from seaopt.control.laws.structures import Prefilter
-from seaopt.machine.page import say_cause
+from seaopt.machine.wording import say_cause
 from tests.machine.conftest import SPEC
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_replay import cause_of
