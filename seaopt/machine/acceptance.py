@@ -21,6 +21,8 @@ from seaopt.logs import Log
 from seaopt.machine.causes import Cause
 from seaopt.machine.decimated import shift_command
 from seaopt.machine.differences.certified import Differences, compare
+from seaopt.machine.differences.rate_of_commands import find_rate
+from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, find_refused, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
@@ -69,6 +71,9 @@ class Acceptance(Result, Worded):
         Of a schedule its variable, where that stood, and its unit.
     gaps : tuple of Gaps or None
         Of each log, what it lacks.
+    stepped : Difference or None
+        The rate at which the law is stepped, where no log has a response and what the machine made of the commands
+        tells that it is another than that of the log's clock.
     """
 
     controller: Controller
@@ -79,6 +84,7 @@ class Acceptance(Result, Worded):
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
     place: tuple[str, float, str] | None = None
     gaps: tuple[Gaps | None, ...] = ()
+    stepped: Difference | None = None
     experiments: tuple[Log, ...] = ()
 
     @property
@@ -105,6 +111,7 @@ class Acceptance(Result, Worded):
             "response": None if self.response is None else self.response.to_dict(),
             "differences": self.differences,
             "left_out": self.left_out,
+            "stepped": self.stepped,
             "place": None if self.place is None else dict(zip(("over", "value", "unit"), self.place, strict=True)),
         }
         return to_content(content)
@@ -170,7 +177,8 @@ def accept(
 
     Law and log go by ticks, and so does the clock of a log that has none of its own: a law that is stepped at another
     rate makes the logged command all the same. The machine goes by seconds, and its response tells the rate; then all
-    of the response is stated in the machine's seconds.
+    of the response is stated in the machine's seconds. Where the command is at its limit in every period, what the
+    machine made of it tells the rate (`stepped`).
 
     A schedule is replayed as its variable moves; its response is judged where that stands still, against the figures
     that the law has there. Predictive control is replayed with its limits; its response is that of the law while none
@@ -255,7 +263,11 @@ def accept(
         except LogError as error:
             left_out[ticks.source] = str(error)
     if not blocks:
-        return replace(result, left_out=left_out)
+        pairs = zip(rows, replays, strict=True)
+        told = [find_rate(law, ticks) for ticks, row in pairs if row.ticks_per_row == 1 and ticks.rendered is None]
+        stepped = next((each for each in told if each is not None), None)
+        kept = () if stepped is not None else result.experiments  # whose clock is wrong
+        return replace(result, left_out=left_out, stepped=stepped, experiments=kept)
     response = judge_response(law, join_blocks(blocks), confidence)
     whole = [ticks for ticks in rows if ticks.source not in left_out]
     if has_dry_friction(law) and any(row.ticks_per_row > 1 for row in replays):

@@ -127,6 +127,8 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     if differences is not None and not differences.inside:
         parts.append("the machine is not one of those certified")
         reasons.append(Reason(what=_say_best(differences)))
+    if result.stepped is not None:
+        reasons.append(Reason(what=say_difference(result.stepped)))
     if response is None and result.replayed:
         reasons += [Reason(what=f"no response: {text}") for text in result.left_out.values()]
     return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons))

@@ -77,11 +77,25 @@ def run_at(bench, machine, rate):
     return so.Log.from_arrays(time=1e-3 * np.arange(len(run)), **signals)
 
 
-def test_a_loop_that_another_rate_takes_near_its_limit_of_stability_is_told_to_check_it(controller, bench):
-    """At half its rate the command is at its limit in each period, so that there is no response to tell it by."""
-    result = so.accept(controller, [run_at(bench, Machine(), 0.5)])
+@pytest.mark.parametrize("rate", [0.5, 0.25])
+def test_a_law_at_another_rate_whose_command_is_at_its_limit_in_each_period_is_named(controller, bench, rate):
+    """There is no response to tell it by, but the machine answers the commands."""
+    machine = replace(Machine(), damping=1.2 * Machine().damping, per_ampere=0.97 * Machine().per_ampere)
+    result = so.accept(controller, [run_at(bench, machine, rate)])
     (text,) = result.left_out.values()
-    assert not result.met and "beyond: check the rate at which the law is stepped" in text
+    assert not result.met and result.response is None and not result.experiments
+    assert "check the rate at which the law is stepped" in text or "check the signs" in text
+    assert result.to_dict()["stepped"]["value"] == 1e3 * rate and f"stepped at {1e3 * rate:g} Hz" in str(result)
+
+
+@pytest.mark.parametrize("changes", [{}, {"drive_sign": -1.0}, {"stiffness": 2.0}, {"mass": 2.0}])
+def test_no_rate_is_named_where_the_law_is_stepped_at_its_own(controller, bench, changes):
+    from seaopt.machine.differences.rate_of_commands import find_rate
+
+    base = Machine()
+    machine = replace(base, **{name: value * getattr(base, name) for name, value in changes.items()})
+    log = bench.log(machine, REFERENCE, noise=2.0)
+    assert find_rate(controller, take_ticks(controller, log)) is None
 
 
 @pytest.mark.parametrize("factors", [{"k": 1.5, "J": 0.7}, {"k": 1 / 1.5, "J": 1 / 0.7}])
