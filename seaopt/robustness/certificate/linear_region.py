@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from seaopt.control import Controller, ControllerSpec, ForceMPC, Frontier, Law, MPCSpec, assess
@@ -16,7 +15,6 @@ from seaopt.control.frontier.rows import FrontierRow
 from seaopt.control.given.assessment import assess_row
 from seaopt.control.laws.delay import DELAY_KEYS
 from seaopt.control.laws.structures import CUSTOM
-from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
 from seaopt.control.tuning.tuner import RobustTo
 
@@ -48,20 +46,16 @@ def sweep_plans(plans: Iterable[ForceMPC], robust_to: RobustTo | None = None) ->
     """Return the rows of plans of several bandwidths, each of its linear region with its outer loop, as
     `seaopt.control.sweep` does of gains. `robust_to`: plants or measured responses besides the design plant.
     """
-    rows: list[FrontierRow] = []
-    laws: list[Controller] = []
-    for mpc in plans:
-        spec, around = mpc.spec, None if mpc.outer is None else partial(_give, mpc.outer)
-        row, law = assess_row(_split_law(mpc), *mpc.design, linear_spec(spec), robust_to, outer=around)
-        limits = {"current_limit_A": spec.current_limit_A, "command_limit": spec.command_limit}
-        limited = replace(law, spec=replace(law.spec, **limits))
-        rows.append(replace(row, force_limit_N=limited.force_limit(spec.bandwidth_hz)))
-        laws.append(law)
-    return Frontier(rows=tuple(rows), controllers=tuple(laws))
+    rows, laws = zip(*(_describe_row(mpc, robust_to or {}) for mpc in plans), strict=True)
+    return Frontier(rows=rows, controllers=laws)
 
 
-def _give(outer: OuterLoop, _: Controller) -> OuterLoop:
-    return outer
+def _describe_row(mpc: ForceMPC, robust_to: RobustTo) -> tuple[FrontierRow, Controller]:
+    spec = mpc.spec
+    row, law = assess_row(_split_law(mpc), *mpc.design, linear_spec(spec), robust_to, outer=lambda _: mpc.outer)
+    limits = {"current_limit_A": spec.current_limit_A, "command_limit": spec.command_limit}
+    limited = replace(law, spec=replace(law.spec, **limits))
+    return replace(row, force_limit_N=limited.force_limit(spec.bandwidth_hz)), law
 
 
 def linear_spec(spec: MPCSpec) -> ControllerSpec:

@@ -18,6 +18,7 @@ from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
 from seaopt.robustness import linear_controller
 from seaopt.robustness.certificate import constrained
+from seaopt.robustness.certificate.linear_region import sweep_plans
 
 TS = 1e-3
 SPEED_LIMIT = {"qd": (-0.08, 0.08)}
@@ -242,3 +243,28 @@ def test_runs_with_limits_active_have_the_outer_loop(monkeypatch, stiffness):
         speed, before = (5e-3 * speed + place - before) / (5e-3 + TS), place
         command, state = mpc.command(state, wanted - stiffness * place - 2.0 * speed, torque)
         assert command == pytest.approx(current, abs=1e-9)
+
+
+@pytest.mark.parametrize("stiffness", [40.0, 0.0])
+def test_a_row_of_a_sweep_has_the_outer_loop(stiffness):
+    """Ms of all that is fed back, force and motion of the link, by python-control's sampled plants."""
+    held, free = so.plants.rotary("locked"), so.plants.rotary()
+    values = free.defaults.update(N=100.0, K_tau=0.0369, eta=0.7, J_m=2.4e-5, b_r=1e-4, k_s=300.0, J_l=0.25, d_l=0.3)
+    mpc = force_mpc(held, values, MPCSpec(measured="tau_s", current_limit_A=8.0, bandwidth_hz=12))
+    asked = Impedance(stiffness=stiffness, damping=2.0, velocity_filter_s=5e-3)
+    mpc = replace(mpc, outer=add_impedance(linear_controller(mpc), free, values, asked, name="free").outer)
+    (row,) = sweep_plans([mpc], {"free": free}).rows
+    law, z = mpc.unlimited(), np.exp(2j * np.pi * np.geomspace(0.05, 499.0, 40_000) * TS)
+    states = np.linalg.solve(z[:, None, None] * np.eye(len(law.a)) - law.a, np.tile(law.b, (z.size, 1, 1)))
+    c_r, c_y = (states.transpose(0, 2, 1) @ law.c + law.d).T
+    speed = (1.0 - 1.0 / z) / (5e-3 + TS - 5e-3 / z)
+    ms = {}
+    for name, plant in (("design plant", held), ("free", free)):
+        model = plant.linearize(values)
+        force = control.sample_system(model["tau_s", "I"], TS, "zoh")(z) / z
+        back = 0.0
+        if plant is free:
+            back = control.sample_system(model["theta_l", "I"], TS, "zoh")(z) / z * c_r * (stiffness + 2.0 * speed)
+        ms[name] = np.max(np.abs(1.0 / (1.0 - force * c_y + back)))
+    worst = max(ms, key=ms.get)
+    assert row.ms == pytest.approx(ms[worst], rel=1e-3) and row.ms_plant == worst
