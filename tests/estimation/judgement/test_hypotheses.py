@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from unittest.mock import Mock
 
 import numpy as np
@@ -68,6 +69,14 @@ def fit(log, plant=None, *, params=None, **options):
     return so.fit([experiment], params, **options)
 
 
+@cache
+def fit_effects(**effects):
+    """Return the fit to a log with some effects, and the shares of its search that were told to be done."""
+    shares = []
+    result = fit(record(**effects), progress=lambda note, share=None: share is None or shares.append(share))
+    return result, shares
+
+
 def find_error(values):
     return max(abs(values[name] / TRUTH[name] - 1.0) for name in ("J_m", "k_s", "b_r", "f_c"))
 
@@ -88,7 +97,7 @@ def find_error(values):
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_removes_the_excess_is_named_with_its_value(effects, part, value):
-    result = fit(record(**effects))
+    result, _ = fit_effects(**effects)
     best = result.hypotheses[0]
     assert (best.parts[0], best.outcome) == (part, "adopted")
     assert len(best.parts) == 1
@@ -210,7 +219,7 @@ def test_the_calls_of_a_proposal_make_a_fit_that_is_right():
     log = record(harder=8.0)
     names = {"so": so, "plant": so.plants.rotary(link="locked")}
     names["params"] = names["plant"].defaults.update(**TRUTH)
-    exec(fit(log).hypotheses[0].python, names)
+    exec(fit_effects(harder=8.0)[0].hypotheses[0].python, names)
     again = fit(log, names["plant"], params=names["params"])
     assert again.met
     assert again.hypotheses == ()
@@ -267,7 +276,7 @@ def test_what_was_held_out_is_no_noise_of_the_sensor():
 
 
 def test_two_effects_are_named_together():
-    best = fit(record(harder=8.0, load=0.08)).hypotheses[0]
+    best = fit_effects(harder=8.0, load=0.08)[0].hypotheses[0]
     assert set(best.parts) == {"hardening", "load_friction"}
     assert best.outcome == "adopted"
     assert find_error(best.parameters) < 0.02
@@ -396,13 +405,12 @@ def test_what_takes_nearly_all_of_a_high_excess_is_named():
 
 
 def test_the_share_of_the_search_that_is_done_only_rises():
-    shares = []
-    fit(record(harder=8.0, load=0.08), progress=lambda note, share=None: share is None or shares.append(share))
-    assert shares == sorted(shares)
+    _, shares = fit_effects(harder=8.0, load=0.08)
+    assert shares and shares == sorted(shares)
 
 
 def test_they_are_kept_in_its_file():
-    result = fit(record(droop=0.005))
+    result, _ = fit_effects(droop=0.005)
     again = so.Fit.from_dict(result.to_dict(), ())
     assert again.hypotheses == result.hypotheses
     assert [finding.proposal for finding in again.findings] == [finding.proposal for finding in result.findings]
