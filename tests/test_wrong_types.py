@@ -162,6 +162,17 @@ CASES = {
     "report's page": lambda: so.write_report([tuned()], None),
     "quality": lambda: assess_quality(None),
 }
+# With what the error says, which is what to write.
+SAID = {
+    "sigma = 2.0": lambda: experiment(sigma=2.0),
+    "list of experiments": lambda: so.fit(experiment(log=LONG), THOR.free("J")),
+    "put them in brackets": lambda: so.compare(
+        so.fit([experiment(log=LONG)], THOR.free("J"), method=so.OutputError(search=False))
+    ),
+    "bandwidth_hz = '30'": lambda: so.ControllerSpec(bandwidth_hz="30"),
+    "delay_samples = 1.0": lambda: so.ControllerSpec(compute_delay_samples=1.0),
+    "robust_to is a list": lambda: so.tune(PLANT, THOR, SPEC, ["swing"]),
+}
 # Lists in the places of tuples: what is meant is clear.
 TAKEN = {
     "outputs in a list": lambda: experiment(outputs=["F1"]),
@@ -177,11 +188,11 @@ def list_bare_errors():
             case()
         except Exception as error:
             bare.append(f"{name}: {error!r}")
-    for name, case in CASES.items():
+    for name, case in (CASES | SAID).items():
         try:
             case()
         except SeaoptError as error:
-            bare += [name] if "\n" in str(error) else []
+            bare += [name] if "\n" in str(error) or (name in SAID and name not in str(error)) else []
         except Exception as error:
             bare.append(f"{name}: {error!r}")
         else:
