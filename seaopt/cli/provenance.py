@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -57,10 +57,16 @@ def digest_sources(problem: Problem, stage: str, folder: Path) -> dict[str, str]
     return out
 
 
-def _read_by_fit(problem: Problem) -> dict[str, Any]:
-    """Return what a fit reads: experiments, their plants and these plants' parameters."""
+def digest_fit_of(problem: Problem, experiments: Collection[str]) -> str:
+    """Return the digest that a fit of some of a problem's experiments has of the problem."""
+    return digest_plain(_read_by_fit(problem, experiments))
+
+
+def _read_by_fit(problem: Problem, of: Collection[str] | None = None) -> dict[str, Any]:
+    """Return what a fit reads: experiments, all or those `of` a fit, their plants and these plants' parameters."""
     table = problem.table.model_dump(mode="json", include={"experiment", "fit", "plant", "parameters"})
-    plants = {experiment.plant for experiment in problem.table.experiment}
+    table["experiment"] = [each for each in table["experiment"] if of is None or each["name"] in of]
+    plants = {each["plant"] for each in table["experiment"]}
     names = {name for plant in plants for name in problem.plants[plant].parameters}.union(problem.parameters.free_names)
     table["plant"] = {name: plant for name, plant in table["plant"].items() if name in plants}
     table["parameters"] = {name: value for name, value in table["parameters"].items() if name in names}

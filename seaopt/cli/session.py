@@ -15,7 +15,7 @@ from typing import Any
 
 from seaopt import __version__
 from seaopt.cli.progress import LEAST_SHARE, show_progress
-from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_sources
+from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_fit_of, digest_sources
 from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law
@@ -344,7 +344,8 @@ class Session:
     def _fit(self, tell: Progress) -> None:
         reading, fitting, again = divide(tell, READING, 1.0 - READING, 1.0 if self.explain else 0.0)
         reading("reading logs", 0.0)
-        result = fit_problem(self.problem, self.experiments(), keep=self._keep_fit, progress=fitting)
+        experiments, start = self.experiments(), self._find_earlier_fit()
+        result = fit_problem(self.problem, experiments, start=start, keep=self._keep_fit, progress=fitting)
         if self.explain:
             found = find_explanation(result)
             if found is None:
@@ -353,6 +354,23 @@ class Session:
                 self._keep_fit(result)
                 result = self._explain(found, result, again)
         self.results["scores"] = self._keep_fit(result)
+
+    def _find_earlier_fit(self) -> Fit | None:
+        """Return the folder's fit where it was made of some of the logs, and of all else as it is."""
+        path = self._path("fit")
+        try:
+            content = read_json(path, SCHEMAS["fit"], remedy="") if path.exists() else {}
+            earlier = Fit.from_dict(content) if content else None
+        except SeaoptError:  # it is replaced, whatever is wrong with it
+            return None
+        if earlier is None or earlier.status != "converged":
+            return None
+        names = {*earlier.nuisance, *content.get("validation", {})}
+        more = [table.name for table in self.problem.table.experiment if table.name not in names]
+        if not more or content["made_from"].get("problem") != digest_fit_of(self.problem, names):
+            return None
+        self._say_once("note", [f"goes on from the values of {path}, which is without {', '.join(more)}"])
+        return earlier
 
     def _keep_fit(self, result: Fit) -> list[ModelledOutputs]:
         """Write a fit that stands, judged or not, in place of the one before; return its scores of other logs."""

@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from seaopt.errors import EstimationError, require_type
 from seaopt.estimation.judgement.judge import CAUSES, TESTS, judge
 from seaopt.estimation.judgement.score_test import free_fixed
@@ -27,6 +29,7 @@ from seaopt.estimation.result.summary import summarise
 from seaopt.estimation.solver.delay_cells import search_delays
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.methods import Method, OutputError
+from seaopt.estimation.solver.settle import Solved
 from seaopt.estimation.solver.step_size import hold_bristles
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -57,6 +60,7 @@ def fit(
     diagnostics: bool = True,
     alternatives: Sequence[Plant] = (),
     validation: Sequence[Experiment] = (),
+    start: Fit | None = None,
     keep: Callable[[Fit], object] | None = None,
     progress: Progress = ignore,
 ) -> Fit:
@@ -84,6 +88,9 @@ def fit(
         Other plants that may have been on the bench: where a log is not explained, they are tried.
     validation : sequence of Experiment
         Logs that are not fitted: each is refitted alone, and what its values differ by is in the model's std.
+    start : Fit, optional
+        An earlier fit of the same plants, of fewer logs: the search goes on from its values and delays, without looking
+        for a start, and looks for one where what it comes to explains little. Priors stay where `params` has them.
     keep : callable, optional
         Called with the fit before it is judged, which may take several times as long as its search; it is not met.
     progress : callable, optional
@@ -120,6 +127,8 @@ def fit(
         raise EstimationError(f"holdout = {holdout:g} is not a fraction; give 0 (none) to 0.9")
     check_choices(chosen, loss, band_hz)
     band = None if band_hz is None else (band_hz[0], band_hz[1])  # a list is taken, too
+    if start is not None:
+        require_type(start, Fit, "start", "give an earlier fit", EstimationError)
     _check_differences(named, chosen)
     _check_motion(named)
     problem = pose_problem(
@@ -141,9 +150,9 @@ def fit(
     callback = _count_iterations(searching)
     before = count_evaluations()
     with keep_passes():
-        solved = search_delays(
-            chosen.solve(hold_bristles(problem, problem.unknowns.start), callback), chosen.max_iterations, callback
-        )
+        solved = None if start is None else _go_on(problem, start, chosen, callback)
+        solved = solved or chosen.solve(hold_bristles(problem, problem.unknowns.start), callback)
+        solved = search_delays(solved, chosen.max_iterations, callback)
         evaluations = count_evaluations() - before
         # Its passes serve all that follows.
         freed = free_fixed(solved.problem, solved.solution.z) if diagnostics else None
@@ -158,6 +167,25 @@ def fit(
         result = replace(result, findings=order_findings((*result.findings, *map(find_sharp_friction, sharp))))
     progress(f"{result.samples} samples, {result.iterations} iterations, {result.status.replace('_', ' ')}", 1.0)
     return result
+
+
+def _go_on(problem: FitProblem, earlier: Fit, method: Method, callback: Callback) -> Solved | None:
+    """Return the minimum near an earlier fit's values; None where it explains little."""
+    values = {name: earlier.parameters[name].value for name in earlier.covariance.names}
+    by_plant = {each.plant: each for each in earlier.nuisance.values()}
+    for experiment in problem.experiments:
+        name, plant = experiment.name, experiment.data.plant.name
+        known = earlier.nuisance.get(name, by_plant.get(plant))
+        if known is None:
+            continue
+        values[f"{name}.delay_s"] = known.delay_s
+        values |= {f"{name}.gain.{output}": gain for output, gain in known.gain.items()}
+        for number, states in enumerate(known.initial_state if name in earlier.nuisance else ()):
+            label = f"{name}.initial{number + 1 if number else ''}"
+            values |= {f"{label}.{state}": value for state, value in states.items()}
+    unknowns = problem.unknowns
+    z = np.clip(unknowns.start_from(values), unknowns.low, unknowns.high)
+    return method.go_on(hold_bristles(problem, z), z, callback)
 
 
 def _name_guesses(result: Fit, experiments: tuple[Experiment, ...], params: ParameterSet) -> Fit:

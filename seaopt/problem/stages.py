@@ -68,6 +68,7 @@ def fit_problem(
     problem: Problem,
     experiments: Sequence[Experiment] | None = None,
     *,
+    start: Fit | None = None,
     keep: Callable[[Fit], object] | None = None,
     progress: Progress = ignore,
 ) -> Fit:
@@ -79,6 +80,8 @@ def fit_problem(
         What `read_problem` returned.
     experiments : sequence of Experiment, optional
         All of the problem's, where they are read already; read here if left out.
+    start : Fit, optional
+        An earlier fit of fewer logs, to go on from, as in `seaopt.fit`.
     keep, progress : callable, optional
         As in `seaopt.fit`.
 
@@ -96,6 +99,7 @@ def fit_problem(
     result = fit(
         fitted,
         problem.parameters,
+        start=start,
         keep=keep,
         progress=progress,
         alternatives=tuple(problem.plants.values()),

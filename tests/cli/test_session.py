@@ -61,6 +61,30 @@ def test_a_run_without_a_controller_says_what_it_left_out(write, tmp_path, capsy
             Session(path, tmp_path / "out").run(stage)
 
 
+def test_a_fit_of_one_more_log_goes_on_from_the_folder_s(write, tmp_path, capsys):
+    """Only where all else is as it was: with another bound, and with the same logs again, it begins afresh."""
+    more = BENCH.replace('name = "lines"', 'name = "more"').replace("seed = 1", "seed = 2")
+    both = BENCH + more[more.index("[[experiment]]") :]
+
+    def fit(text, folder):
+        session = Session(write(text), tmp_path / folder)
+        session.run("fit")
+        return session.results["fit"], "goes on from the values of" in " ".join(capsys.readouterr().err.split())
+
+    afresh, went_on = fit(both, "new")
+    assert not went_on
+    one, went_on = fit(BENCH, "out")
+    assert not went_on
+    going_on, went_on = fit(both, "out")
+    assert went_on
+    assert going_on.parameters["J"].value == pytest.approx(afresh.parameters["J"].value, rel=1e-6)
+    assert going_on.parameters["J"].std == pytest.approx(afresh.parameters["J"].std, rel=1e-3)
+    assert one.parameters["J"].value != going_on.parameters["J"].value
+    assert not fit(both, "out")[1]
+    fit(BENCH, "out")
+    assert not fit(both.replace("max = 1e-4", "max = 1e-3"), "out")[1]
+
+
 def test_simulate_writes_the_model_and_the_virtual_log(write, tmp_path, capsys):
     """The log has the true inertia and a noise of 2 N, the model the file's values and no noise."""
     problem = so.read_problem(write(BENCH))

@@ -44,6 +44,11 @@ class Method(ABC):
     def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Return the minimum, and the problem with the sigma and the step with which it was found."""
 
+    def go_on(self, problem: FitProblem, z: Vector, callback: Callback | None) -> Solved | None:
+        """Return the minimum near values that an earlier search has found; None where it explains little."""
+        solved = settle(problem, problem.evaluate(z), self.max_iterations, name_phase(callback, "from an earlier fit"))
+        return solved if solved.follows_log else None
+
 
 @record
 class OutputError(Method):
@@ -209,6 +214,11 @@ class PredictionError(Method):
             if not _simulates_badly(simulated):
                 solved = self._settle_predicting(problem, simulated.solution.z, callback) or solved
         return solved if solved is not None else settle(problem, best, self.max_iterations, callback)
+
+    def go_on(self, problem: FitProblem, z: Vector, callback: Callback | None) -> Solved | None:
+        """Return the minimum of the errors of prediction near such values; None where it simulates badly."""
+        solved = self._settle_predicting(problem, z, callback)
+        return None if solved is None or _simulates_badly(solved) else solved
 
     def _settle_predicting(self, problem: FitProblem, start: Vector, callback: Callback | None) -> Solved | None:
         """Return the minimum of the errors of prediction near a start; None where no filter is found."""
