@@ -1,9 +1,8 @@
-"""numpyro's NUTS on the problem of problem.py, as `../bench_referee.py` asks it; prior flat within the bounds.
+"""numpyro's NUTS on the posterior of posterior_jax.py, as `../bench_referee.py` asks it.
 
     python peer_nuts.py FILE.npz --draws 4000
 
-The file has current, force, and where and how wide to begin (`center`, `factor`: a Cholesky factor, which scales the
-unknowns and changes no posterior). One line of JSON: quantiles of each parameter, and how the chains mixed.
+One line of JSON: quantiles of each parameter, and how the chains mixed.
 """
 
 from __future__ import annotations
@@ -12,12 +11,11 @@ import argparse
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import simulate_jax
 from numpyro.diagnostics import effective_sample_size, split_gelman_rubin
 from numpyro.infer import MCMC, NUTS
-from problem import LOWER, NAMES, SUBSTEPS, UPPER, Data
+from posterior_jax import read_posterior
+from problem import NAMES
 
 CHAINS = 4
 
@@ -29,16 +27,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=2000, help="of each of four chains")
     parser.add_argument("--quantiles", type=float, nargs="+", required=True)
     given = parser.parse_args()
-    with np.load(given.data) as content:
-        data = Data(current=content["current"], force=content["force"], std=content["std"])
-        center, factor = jnp.asarray(content["center"]), jnp.asarray(content["factor"])
-    residual = simulate_jax.residual(data, SUBSTEPS)
-
-    def potential(u: jax.Array) -> jax.Array:
-        theta = center + factor @ u
-        inside = jnp.all((theta > LOWER) & (theta < UPPER))
-        return jnp.where(inside, 0.5 * jnp.sum(residual(jnp.where(inside, theta, center)) ** 2), jnp.inf)
-
+    potential, center, factor = read_posterior(given.data)
     kernel = NUTS(potential_fn=potential)
     sampler = MCMC(kernel, num_warmup=300, num_samples=given.draws, num_chains=CHAINS, chain_method="sequential",
                    progress_bar=False)  # fmt: skip
