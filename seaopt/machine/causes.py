@@ -20,7 +20,7 @@ from seaopt.control.laws.structures import Gains
 from seaopt.errors import SeaoptError
 from seaopt.machine.free_gains import find_same, fit_gains, make_law, read_gains
 from seaopt.machine.stepped import Match, Setting, count_head, find_limited, find_modes, follow, limit_law, play
-from seaopt.machine.ticks import Ticks
+from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
 LEAST_HEAD = 60  # rows within the limit that factors take
@@ -86,7 +86,9 @@ class Alternative:
 
 def find_causes(whole: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[tuple[Cause, ...], Setting]:
     """Return the causes that explain a mismatch, the best first, and the setting as the first (and a second) has it."""
-    middle, size = int(np.argmax(np.abs(match.error))), max(WINDOW, count_head(whole.linear))
+    limited = find_limited(whole.ticks) | (np.abs(whole.ticks.command) >= AT_LIMIT * whole.linear.command_limit)
+    size = max(WINDOW, count_head(whole.linear))  # about the largest mismatch but where all laws are alike
+    middle = int(np.argmax(np.abs(match.error) * (~limited if np.any(~limited) else 1.0)))
     begin = max(0, min(middle - size // 2, len(whole.ticks) - size))
     window = replace(whole, ticks=whole.ticks.take(slice(begin, begin + size)))
     here = play(window)
@@ -115,22 +117,33 @@ Tried = tuple[Alternative, Match]
 def _look_further(
     whole: Setting, window: Setting, tried: Sequence[Tried], others: Mapping[str, Controller], much: bool
 ) -> tuple[Tried, Tried | None]:
-    """Return what explains more than single causes do: a second one behind the best, which removes `much`, or another
-    set of gains, by itself or behind a limit.
+    """Return what explains more than single causes do: a second one behind the best, which removes `much`; another set
+    of gains; either of a command that is logged a row late or early; gains behind a limit.
     """
     best, energy = tried[0], tried[0][1].energy
-    if much:
-        second = min(_try_all(best[0].change(window), {}), key=lambda pair: pair[1].energy, default=None)
-        if second is not None and second[1].met:
-            return best, second
-    if (gains := _try_gains(whole, window, energy, others)) is not None:
+    if much and (second := _find_behind(best, window, {})) is not None:
+        return best, second
+    gains = _try_gains(whole, window, energy, others)
+    if gains is not None and gains[1].met:
         return gains, None
     rivals = list[tuple[Tried, Tried]]()
-    for first in [pair for pair in tried if pair[0].kind == "limit"]:
+    for first in [pair for pair in tried if pair[0].kind in ("late", "limit")]:
+        if first[0].kind == "late" and (first[0].what != "command" or abs(first[0].value or 0.0) != 1.0):
+            continue
         change = first[0].change
-        if (gains := _try_gains(change(whole), change(window), energy, others)) is not None:
-            rivals.append((first, gains))
-    return min(rivals, key=lambda pair: _rank(pair[1]), default=(best, None))
+        behind = _find_behind(first, window, others) if first[0].kind == "late" else None
+        behind = behind or _try_gains(change(whole), change(window), energy, others)
+        if behind is not None and behind[1].met:
+            rivals.append((first, behind))
+    if rivals:
+        return min(rivals, key=lambda pair: _rank(pair[1]))
+    return (best, None) if gains is None else (gains, None)
+
+
+def _find_behind(first: Tried, window: Setting, others: Mapping[str, Controller]) -> Tried | None:
+    """Return the cause that explains what a first one leaves; None where none explains all of it."""
+    second = min(_try_all(first[0].change(window), others), key=_rank, default=None)
+    return second if second is not None and second[1].met else None
 
 
 def _try_gains(whole: Setting, window: Setting, energy: float, others: Mapping[str, Controller]) -> Tried | None:
@@ -151,10 +164,13 @@ def _try_gains(whole: Setting, window: Setting, energy: float, others: Mapping[s
     return played if played is not None and (played[1].met or played[1].energy < LESS * energy) else None
 
 
-def _rank(pair: tuple[Alternative, Match]) -> tuple[bool, bool, float]:
-    """Return the order of a cause: one that explains all first, and of those the ones without a fitted size."""
+def _rank(pair: Tried) -> tuple[bool, bool, bool, float]:
+    """Return the order of a cause: one that explains all first, and of those the ones without a fitted size. At the
+    limit many do: a sign runs away, a unit seldom does.
+    """
     alternative, match = pair
-    return not match.met, match.met and alternative.kind in ("gain", "factor"), match.energy
+    fitted, unit = alternative.kind in ("gain", "factor"), alternative.kind == "unit"
+    return not match.met, match.met and fitted, match.met and unit, match.energy
 
 
 def _make_cause(alternative: Alternative, played: Match, before: float) -> Cause:

@@ -82,11 +82,10 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
             return _describe_lines(whole, lines, ticks_per_row)
         if first is not None and first.kind == "late" and first.what == "command" and first.explains:
             late, causes, match = int(first.value or 0), (), play(changed)
+        elif (names := _find_open(whole, match, first)) is not None:
+            causes = (Cause(kind="open loop", what=names, value=None, unit="", removes=1.0, explains=True),)
         elif first is not None and first.explains and play(replace(changed, rounded=False)).met:
             match = play(replace(whole, rounded=False))  # what is read in coarse steps is counts
-        elif (first is None or not first.explains) and (names := find_unfollowed(whole, match)):
-            what = join_words(names)
-            causes = (Cause(kind="open loop", what=what, value=None, unit="", removes=1.0, explains=True),)
     rate_hz, law_rate_hz = ticks.rate_hz, 1.0 / whole.controller.sample_time_s
     if match.met and abs(rate_hz / law_rate_hz - 1.0) > SAME_RATE:
         causes = (Cause(kind="rate", what="clock", value=rate_hz, unit="Hz", removes=1.0, explains=True),)
@@ -113,6 +112,15 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
         law_rate_hz=law_rate_hz,
         causes=causes,
     )
+
+
+def _find_open(whole: Setting, match: Match, first: Cause | None) -> str | None:
+    """Return the signals that a command does not follow; None where it does, or a cause other than gains, which may
+    be fitted to a command that was played, explains it.
+    """
+    if first is not None and first.explains and first.kind != "gains":
+        return None
+    return join_words(find_unfollowed(whole, match)) or None
 
 
 def replay_stretches(

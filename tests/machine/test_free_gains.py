@@ -13,7 +13,7 @@ from seaopt.control.laws.structures import Prefilter
 from seaopt.machine.wording import say_cause
 from tests.machine.conftest import SPEC
 from tests.machine.simulator import Bench, Machine, multisine
-from tests.machine.test_replay import cause_of
+from tests.machine.test_replay import cause_of, rename
 
 CHANGES = {"k_p": 0.8, "k_i": 1.6, "k_d": 0.9, "T_f": 0.6, "k_r": 0.85, "c": 0.5}
 LINES = np.unique(np.round(np.geomspace(1, 120, 40)).astype(int))
@@ -82,3 +82,27 @@ def test_a_fault_of_one_number_is_not_called_another_set(controller, bench, fact
     log = bench.log(replace(Machine(), law_gain=factor) if factor > 0 else replace(Machine(), reading_sign=-1.0), LARGE)
     (row,) = so.accept(controller, [log]).replays
     assert "gains" not in {cause.kind for cause in row.causes}
+
+
+@pytest.mark.parametrize("late", [1, -1])
+def test_a_fault_of_a_log_whose_command_is_a_row_late_is_named(compiler, tmp_path, controller, bench, late):
+    def shift(log):
+        return rename(log, I=np.roll(log["I"], late)).between(0.1, 3.8)
+
+    half = so.accept(controller, [shift(bench.log(replace(Machine(), law_gain=0.5), GENTLE))])
+    first, second = half.replays[0].causes[:2]
+    assert (first.kind, first.what, first.value) == ("late", "command", late)
+    assert (second.kind, second.what, second.besides, second.explains) == ("factor", "I", True, True)
+    assert second.value == pytest.approx(0.5) and "late, and I is 0.5 times" in " ".join(str(half).split())
+    numbers = {name: CHANGES[name] * controller.gains[name] for name in CHANGES}
+    log = make_bench(compiler, tmp_path, controller, Gains.from_names(numbers)).log(Machine(), GENTLE)
+    first, second = so.accept(controller, [shift(log)]).replays[0].causes[:2]
+    assert (first.kind, second.kind, second.besides) == ("late", "gains", True)
+    assert second.gains == pytest.approx(numbers, rel=1e-6)
+
+
+def test_of_a_command_that_is_all_at_its_limit_the_sign_is_named_ahead_of_units(controller, bench):
+    log = bench.log(replace(Machine(), reading_sign=-1.0), GENTLE).between(0.1, 3.8)
+    assert np.mean(np.abs(log["I"]) >= 9.0 - 1e-6) > 0.99
+    first = so.accept(controller, [log]).replays[0].causes[0]
+    assert (first.kind, first.value) == ("sign", -1.0)
