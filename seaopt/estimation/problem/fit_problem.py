@@ -22,7 +22,7 @@ where noise is hardly there it is the true second derivative.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from dataclasses import replace
@@ -276,7 +276,7 @@ def count_left() -> float:
 
 
 @contextmanager
-def limit_evaluations(count: float) -> Iterator[None]:
+def limit_evaluations(count: float) -> Generator[None]:
     """Refuse evaluations inside after so many, with `BudgetError`; a limit around it holds, too."""
     token = _most.set(min(_most.get(), _evaluations.get() + count))
     try:

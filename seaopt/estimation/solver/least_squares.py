@@ -100,7 +100,7 @@ def minimise(
         return Solution(z=current.z, evaluation=current, status="stalled", message=message, iterations=0)
     scale = _column_norms(current)
     radius = first_radius * max(float(np.linalg.norm(scale * current.z)), 1.0)
-    unchanged, lost, best = 0, 0, current.cost
+    unchanged, lost, best, iteration = 0, 0, current.cost, 1
     for iteration in range(1, max_iterations + 2):  # after the last step convergence is tested once more
         blocked = find_blocked(current, low, high)
         distance = current.distance_squared(~blocked)
