@@ -20,6 +20,7 @@ from seaopt.machine.decimated import SAME_RATE, LineMatch, count_ticks_per_row, 
 from seaopt.machine.hidden import find_hidden
 from seaopt.machine.open_loop import find_unfollowed
 from seaopt.machine.stepped import FLOOR, Match, Setting, Source, make_setting, play
+from seaopt.machine.stopped import find_stop
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
@@ -82,6 +83,8 @@ def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None
             return _describe_lines(whole, lines, ticks_per_row)
         if first is not None and first.kind == "late" and first.what == "command" and first.explains:
             late, causes, match = int(first.value or 0), (), play(changed)
+        elif (stop := find_stop(whole, match)) is not None:
+            causes = (stop,)
         elif (names := _find_open(whole, match, first)) is not None:
             causes = (Cause(kind="open loop", what=names, value=None, unit="", removes=1.0, explains=True),)
         elif first is not None and first.explains and play(replace(changed, rounded=False)).met:

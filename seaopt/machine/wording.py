@@ -85,6 +85,11 @@ def say_cause(cause: Cause) -> str:
             return f"the {cause.what} is missing"
         case "gains":
             return _say_gains(cause)
+        case "stopped":
+            return (
+                f"it is this law until the command was stopped, which is zero from {value} s on: a gate that tripped, "
+                "a signal that left its figure, or a hand; look at the status that the law logs, and record again"
+            )
         case "another law":
             return f"it is the law of {cause.what}"
         case _:

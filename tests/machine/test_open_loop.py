@@ -9,7 +9,8 @@ import pytest
 from scipy.signal import chirp, cont2discrete, lfilter
 
 import seaopt as so
-from tests.machine.simulator import Machine, multisine
+from seaopt.control import PlausibilityGate
+from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_replay import LINES, REFERENCE
 
 N = 6000
@@ -71,3 +72,26 @@ def test_readings_without_noise_tell_nothing(controller):
     """Rounding is noise that no law saw."""
     for decimals in (0, 9):
         assert not is_open(controller, play(PLAYED["multisine"], 0.0 * TIME, noise=0.0, decimals=decimals))
+
+
+@pytest.mark.parametrize("fades", [0, 80])
+def test_a_command_that_was_stopped_is_no_open_loop(controller, bench, fades):
+    log = bench.log(Machine(), REFERENCE)
+    command, stop = log["I"].copy(), 2500
+    command[stop:] *= np.clip(1.0 - np.arange(len(log) - stop) / max(fades, 1e-9), 0.0, None)
+    columns = {name: log[name] for name in ("reference", "F1")}
+    result = so.accept(controller, [so.Log.from_arrays(time=log.time, I=command, **columns)])
+    first = result.replays[0].causes[0]
+    assert (first.kind, first.what) == ("stopped", "command") and not result.met
+    assert first.value == pytest.approx((stop + fades) * 1e-3, abs=2e-3)
+    assert "it is this law until the command was stopped" in " ".join(str(result).split())
+
+
+def test_a_gate_of_the_firmware_that_tripped_is_a_stop(compiler, tmp_path, controller):
+    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_A_per_s=50.0)
+    bench = Bench(compiler, tmp_path, replace(controller, gate=gate))
+    reference = 0.3 * REFERENCE
+    reference[3000:] += 3000.0  # the force goes beyond the range
+    log = bench.log(Machine(), reference)
+    first = so.accept(controller, [log]).replays[0].causes[0]
+    assert (first.kind, first.what) == ("stopped", "command") and 3.0 < first.value < 3.5
