@@ -15,6 +15,8 @@ from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError, ProblemError
 from seaopt.problem.stages import certify_problem, list_plants, tune_problem
+from seaopt.robustness.certificate.simulated import SIMULATIONS
+from tests.checks import leave_out
 
 FILE = """
 schema = 1
@@ -224,8 +226,9 @@ def test_a_law_of_ones_own_is_measured_on_the_response(write, tmp_path):
     assert own.achieved.ms == pytest.approx(tuned.achieved.ms, rel=1e-9)
 
 
-def test_a_schedule_keeps_its_limits_on_a_response_at_the_point_where_it_was_taken(write, tmp_path):
+def test_a_schedule_keeps_its_limits_on_a_response_at_the_point_where_it_was_taken(write, monkeypatch):
     """The stand was measured with its own spring, which is a point; the other spring is known of the model alone."""
+    leave_out(monkeypatch, SIMULATIONS)
     path, own = write(), 655000
     table = f'[controller.schedule]\nover = "k"\npoints = [{own}, 750000]\n[robustness]'
     path.write_text(path.read_text().replace("[robustness]", table))
@@ -249,7 +252,7 @@ def test_a_schedule_keeps_its_limits_on_a_response_at_the_point_where_it_was_tak
         tune_problem(problem, problem.parameters)
 
 
-def test_without_a_model_no_fit_is_needed_and_points_are_certified(write, tmp_path):
+def test_without_a_model_no_fit_is_needed_and_points_are_certified(write, tmp_path, without_drawing):
     path = write("frf:chirp", "").rename(tmp_path / "points.toml")
     path.write_text(path.read_text().split("[robustness]")[0])
     out, run = tmp_path / "out", CliRunner()

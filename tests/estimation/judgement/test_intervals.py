@@ -131,6 +131,7 @@ def test_a_cause_that_leaves_the_values_is_an_error_where_the_residual_is_far_ab
     assert result.met is met
 
 
+@pytest.mark.usefixtures("without_hypotheses")
 def test_a_value_that_is_known_only_roughly_is_named(thor):
     """Efficiency and torque constant are one scale: a prior of 30 % on the one is all that is known of either."""
     stand, sensors = so.plants.high_impedance(), so.Sensors(noise_std={"F1": 2.0, "F2": 2.0})

@@ -131,6 +131,7 @@ def test_another_plant_of_the_problem_is_named():
     assert swing.name in cause(result)
 
 
+@pytest.mark.usefixtures("without_hypotheses")
 def test_clipping_ahead_of_the_noise_is_found():
     columns, rng = bench(noise_n=0.0), np.random.default_rng(5)
     level = 1.5 * np.std(columns["F1"])
@@ -141,6 +142,7 @@ def test_clipping_ahead_of_the_noise_is_found():
     assert find_clipping(rng.normal(size=500), rng.normal(size=500)) is None
 
 
+@pytest.mark.usefixtures("without_hypotheses")
 def test_few_samples_bounds_and_implausible_values_are_errors():
     columns = bench()
     assert "samples" in kinds(fit({name: values[:40] for name, values in columns.items()}))
@@ -232,6 +234,7 @@ def test_an_output_of_another_sign_or_unit_is_named_once_with_the_line_to_write(
     assert words.count("worse than a constant") == 1
 
 
+@pytest.mark.usefixtures("without_hypotheses")
 def test_a_small_misfit_that_follows_the_input_far_above_the_noise_is_an_error():
     """An echo of 2 % of the forces, 40 ms late: estimates are off by many of the stds, which allow for noise alone."""
     columns = bench(noise_n=0.1)
