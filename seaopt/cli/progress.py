@@ -16,6 +16,15 @@ from seaopt.cli.terminal import Terminal
 from seaopt.formatting import printable
 from seaopt.progress import Progress
 
+LABELS = {
+    "simulate": "simulating",
+    "frf": "frequency responses",
+    "fit": "fitting the logs",
+    "tune": "tuning the controller",
+    "sweep": "tuning at every bandwidth",
+    "certify": "certifying",
+    "report": "writing the report",
+}
 SHOWN_AFTER_S = 2.0  # a stage that is done before shows no progress
 LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
 # CAUTION: times what the measured speed makes of the remaining share; MOST: times what was spent, for which is told

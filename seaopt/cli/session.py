@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from seaopt import __version__
-from seaopt.cli.progress import LEAST_SHARE, show_progress
+from seaopt.cli.progress import LABELS, LEAST_SHARE, show_progress
 from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_fit_of, digest_sources
 from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
@@ -67,15 +67,6 @@ SCHEMAS = {
     "tune": CONTROLLER_SCHEMA,
     "sweep": FRONTIER_SCHEMA,
     "certify": ROBUSTNESS_SCHEMA,
-}
-LABELS = {
-    "simulate": "simulating",
-    "frf": "frequency responses",
-    "fit": "fitting the logs",
-    "tune": "tuning the controller",
-    "sweep": "tuning at every bandwidth",
-    "certify": "certifying",
-    "report": "writing the report",
 }
 OWN_LAW = "; as a law of your own it is taken by seaopt certify PROBLEM --controller FILE -o DIR"
 EXPLAINED = "explained.toml"  # lines that a problem file lacks
