@@ -93,7 +93,7 @@ def accept_logs(
             source,
             read,
             at=at,
-            others=_find_others(folder, path, controller),
+            others=_find_others(folder, path),
             uncertainty=session.parameters(),
             ranges=take_ranges(controller, session.problem.ranges),
             played=_find_played(folder, stage, path),
@@ -175,14 +175,16 @@ def _list_units(controller: Controller) -> dict[str, str]:
     return {REFERENCE: command.reference_unit, command.input: command.unit, **read}
 
 
-def _find_others(folder: Path, own: Path, controller: Controller) -> dict[str, Controller]:
+def _find_others(folder: Path, own: Path) -> dict[str, Controller | ScheduledController]:
     """Return the other controllers that lie in a folder, and two levels below, by their files."""
-    others: dict[str, Controller] = {}
+    others: dict[str, Controller | ScheduledController] = {}
     for path in sorted([*folder.glob("*.json"), *folder.glob("*/*.json"), *folder.glob(f"{BRING_UP}/*/*.json")]):
         if path == own or not path.is_file():
             continue
         try:
-            others[str(path.relative_to(folder))] = Controller.read(read_json(path, SCHEMAS["tune"]))
+            content = read_json(path, SCHEMAS["tune"])
+            kind = ScheduledController if content.get("schedule") else Controller
+            others[str(path.relative_to(folder))] = kind.read(content)
         except SeaoptError:  # another kind of file, or of another version
             continue
     return others

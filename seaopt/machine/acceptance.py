@@ -26,7 +26,7 @@ from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, find_refused, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
-from seaopt.machine.stepped import SAME_PLACE, Source, stand
+from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand
 from seaopt.machine.ticks import Gaps, Ticks, take_ticks
 from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
@@ -123,7 +123,7 @@ def accept(
     *,
     reference: str | None = None,
     at: float | None = None,
-    others: Mapping[str, Controller] | None = None,
+    others: Others | None = None,
     uncertainty: Fit | ParameterSet | None = None,
     ranges: Mapping[str, tuple[float, float]] | None = None,
     confidence: float = 0.95,
@@ -292,7 +292,7 @@ def _take_whole(source: Source, log: Log, ticks: Ticks, row: Replay, reference: 
     return ticks.move_command(row.command_late) if row.command_late else ticks
 
 
-def _check_header(source: Source, log: Log, row: Replay, others: Mapping[str, Controller]) -> Replay:
+def _check_header(source: Source, log: Log, row: Replay, others: Others) -> Replay:
     """Return a replay with the law that the log says it was taken under, where that is another and the replay does not
     tell why.
     """

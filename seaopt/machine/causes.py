@@ -15,11 +15,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control import Controller, ForceMPC, RunnableSchedule, runnable
+from seaopt.control import Controller, ForceMPC, RunnableSchedule, ScheduledController, runnable
 from seaopt.control.laws.structures import Gains
 from seaopt.errors import SeaoptError
 from seaopt.machine.free_gains import find_same, fit_gains, make_law, read_gains
-from seaopt.machine.stepped import Match, Setting, count_head, find_limited, find_modes, follow, limit_law, play
+from seaopt.machine.stepped import (
+    Match,
+    Others,
+    Setting,
+    count_head,
+    find_limited,
+    find_modes,
+    follow,
+    limit_law,
+    play,
+)
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
@@ -84,7 +94,7 @@ class Alternative:
     exported: Mapping[str, float] | None = None
 
 
-def find_causes(whole: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[tuple[Cause, ...], Setting]:
+def find_causes(whole: Setting, match: Match, others: Others) -> tuple[tuple[Cause, ...], Setting]:
     """Return the causes that explain a mismatch, the best first, and the setting as the first (and a second) has it."""
     limited = find_limited(whole.ticks) | (np.abs(whole.ticks.command) >= AT_LIMIT * whole.linear.command_limit)
     size = max(WINDOW, count_head(whole.linear))  # about the largest mismatch but where all laws are alike
@@ -115,7 +125,7 @@ Tried = tuple[Alternative, Match]
 
 
 def _look_further(
-    whole: Setting, window: Setting, tried: Sequence[Tried], others: Mapping[str, Controller], much: bool
+    whole: Setting, window: Setting, tried: Sequence[Tried], others: Others, much: bool
 ) -> tuple[Tried, Tried | None]:
     """Return what explains more than single causes do: a second one behind the best, which removes `much`; another set
     of gains; either of a command that is logged a row late or early; gains behind a limit.
@@ -140,13 +150,13 @@ def _look_further(
     return (best, None) if gains is None else (gains, None)
 
 
-def _find_behind(first: Tried, window: Setting, others: Mapping[str, Controller]) -> Tried | None:
+def _find_behind(first: Tried, window: Setting, others: Others) -> Tried | None:
     """Return the cause that explains what a first one leaves; None where none explains all of it."""
     second = min(_try_all(first[0].change(window), others), key=_rank, default=None)
     return second if second is not None and second[1].met else None
 
 
-def _try_gains(whole: Setting, window: Setting, energy: float, others: Mapping[str, Controller]) -> Tried | None:
+def _try_gains(whole: Setting, window: Setting, energy: float, others: Others) -> Tried | None:
     """Return the law with another set of gains, all fitted at once, and its match, where it leaves much less of the
     mismatch than any single cause.
     """
@@ -186,7 +196,7 @@ def _make_cause(alternative: Alternative, played: Match, before: float) -> Cause
     )
 
 
-def _try_all(setting: Setting, others: Mapping[str, Controller]) -> Iterator[tuple[Alternative, Match]]:
+def _try_all(setting: Setting, others: Others) -> Iterator[tuple[Alternative, Match]]:
     return _play_each(setting, list_alternatives(setting, others))
 
 
@@ -200,7 +210,7 @@ def _play_each(setting: Setting, alternatives: Iterable[Alternative]) -> Iterato
             yield alternative, played
 
 
-def list_alternatives(setting: Setting, others: Mapping[str, Controller]) -> Iterator[Alternative]:
+def list_alternatives(setting: Setting, others: Others) -> Iterator[Alternative]:
     """Yield what may be the cause, those that change the log first."""
     yield from _list_of_time(setting)
     yield from _list_factors(setting)
@@ -210,16 +220,20 @@ def list_alternatives(setting: Setting, others: Mapping[str, Controller]) -> Ite
     yield from list_others(setting, others)
 
 
-def list_others(setting: Setting, others: Mapping[str, Controller]) -> Iterator[Alternative]:
+def list_others(setting: Setting, others: Others) -> Iterator[Alternative]:
     """Yield laws that may have run in its place, of those that read the same."""
-    signals = setting.controller.signals
+    law, signals = setting.law, setting.controller.signals
+    over = law.table.over if isinstance(law, RunnableSchedule) else None
     for name, other in others.items():
-        if other.signals == signals:
+        first = other.controllers[0] if isinstance(other, ScheduledController) else other
+        if first.signals == signals and (isinstance(other, Controller) or other.over == over):
             yield Alternative(kind="another law", what=name, change=lambda given, other=other: _take_law(given, other))
 
 
-def _take_law(setting: Setting, controller: Controller) -> Setting:
-    return replace(setting, controller=controller, law=runnable(controller))
+def _take_law(setting: Setting, other: Controller | ScheduledController) -> Setting:
+    if isinstance(other, ScheduledController):
+        return replace(setting, law=other.runnable())
+    return replace(setting, controller=other, law=runnable(other))
 
 
 def _change_ticks(change: Callable[[Ticks], Ticks]) -> Callable[[Setting], Setting]:

@@ -24,7 +24,7 @@ of a command that is as good as the same, :math:`a = \Phi^T d/\Phi^T\Phi` is the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -40,7 +40,7 @@ from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_pa
 from seaopt.machine.free_gains import read_gains
 from seaopt.machine.response.periods import Blocks, cut_periods
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
-from seaopt.machine.stepped import SAME_PLACE, Setting
+from seaopt.machine.stepped import SAME_PLACE, Others, Setting
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
@@ -221,7 +221,7 @@ class Table:
         """Return what commands so many ticks earlier are multiplied by."""
         return shift_command(self.controller, replace(self.blocks, effort=np.ones_like(self.made)), ticks).effort
 
-    def list_shifts(self, others: Mapping[str, Controller]) -> Iterator[Shift]:
+    def list_shifts(self, others: Others) -> Iterator[Shift]:
         """Yield what may run in place of the law, or stand in its log."""
         controller, blocks, made = self.controller, self.blocks, self.made
         law, signals = controller.law, controller.signals
@@ -238,7 +238,11 @@ class Table:
             role = "excluded" if late == 1 else "tried"
             yield Shift(kind="late", what="readings", commands=commands, value=late, unit="ticks", role=role)
         for name, other in others.items():
-            if other.signals == signals and math.isclose(other.sample_time_s, law.sample_time_s, rel_tol=1e-3):
+            if (
+                isinstance(other, Controller)
+                and other.signals == signals
+                and math.isclose(other.sample_time_s, law.sample_time_s, rel_tol=1e-3)
+            ):
                 yield Shift(kind="another law", what=name, commands=self.differ(other.law))
         gains = read_gains(controller)
         if gains is not None:
@@ -281,7 +285,7 @@ def count_ticks_per_row(controller: Controller, ticks: Ticks) -> int:
     return whole if 2 <= whole <= MOST and abs(ratio / whole - 1.0) <= SAME_RATE else 1
 
 
-def match_lines(setting: Setting, ticks_per_row: int, others: Mapping[str, Controller]) -> LineMatch:
+def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMatch:
     """Return how a law matches a log line by line, or why that cannot be told."""
     controller, ticks, law = setting.controller, setting.ticks, setting.law
     if setting.linear.compensation is not None:

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from seaopt.control import Controller, RunnableLaw, runnable
 from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.errors import SeaoptError
-from seaopt.machine.stepped import FLOOR, Setting, drive_law, find_limited, list_powers
+from seaopt.machine.stepped import FLOOR, Others, Setting, drive_law, find_limited, list_powers
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
 
@@ -187,11 +187,11 @@ def _find_free(setting: Setting) -> list[Ticks]:
     return found if MOST - left >= FEWEST else []
 
 
-def find_same(gains: Gains, others: Mapping[str, Controller]) -> str | None:
+def find_same(gains: Gains, others: Others) -> str | None:
     """Return which of other laws has these gains; None where none has."""
     found = gains.by_name()
     for name, other in others.items():
-        stated: dict[str, Any] = dict(other.gains)
+        stated: dict[str, Any] = dict(other.gains) if isinstance(other, Controller) else {}
         if stated.keys() == found.keys() and all(
             abs(found[key] - stated[key]) <= SAME_GAINS * abs(stated[key]) for key in found
         ):

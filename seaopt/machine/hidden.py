@@ -24,17 +24,26 @@ Journal 27, 1948), and nothing is told.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control import Controller, RunnableLaw
+from seaopt.control import RunnableLaw
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.machine.causes import Alternative, Cause, list_others, list_parts
 from seaopt.machine.free_gains import make_law, read_gains
-from seaopt.machine.stepped import FLOOR, LEVELS, Match, Setting, count_integrals, leave_integrals, play
+from seaopt.machine.stepped import (
+    FLOOR,
+    LEVELS,
+    Match,
+    Others,
+    Setting,
+    count_integrals,
+    leave_integrals,
+    play,
+)
 from seaopt.machine.ticks import find_saturated
 from seaopt.records import record
 
@@ -120,7 +129,7 @@ def respond(law: RunnableLaw, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray,
     return law.per_effort * (direct[:, None] + np.einsum("i,mik->km", law.c, states))
 
 
-def find_hidden(setting: Setting, match: Match, others: Mapping[str, Controller]) -> tuple[Cause, ...]:
+def find_hidden(setting: Setting, match: Match, others: Others) -> tuple[Cause, ...]:
     """Return the laws of which the log is rather than of this one, the surest first, though the command is off by no
     more than rounding allows; none where it is of this one, or does not tell.
     """
@@ -156,7 +165,7 @@ def find_hidden(setting: Setting, match: Match, others: Mapping[str, Controller]
     return tuple(cause for _, cause in found)
 
 
-def _list_hidden(setting: Setting, others: Mapping[str, Controller]) -> Iterator[tuple[Alternative, float | None]]:
+def _list_hidden(setting: Setting, others: Others) -> Iterator[tuple[Alternative, float | None]]:
     """Yield other laws, and of those with a gain of another size that gain."""
     for alternative in list_others(setting, others):
         yield alternative, None

@@ -8,18 +8,16 @@ them, and where another cause leaves nothing without it, which rounding would no
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from seaopt.control import Controller
 from seaopt.formatting import join_words
 from seaopt.machine.causes import Cause, find_causes, leave_open
 from seaopt.machine.decimated import SAME_RATE, LineMatch, count_ticks_per_row, match_lines
 from seaopt.machine.hidden import find_hidden
 from seaopt.machine.open_loop import find_unfollowed
-from seaopt.machine.stepped import FLOOR, Match, Setting, Source, make_setting, play
+from seaopt.machine.stepped import FLOOR, Match, Others, Setting, Source, make_setting, play
 from seaopt.machine.stopped import find_stop
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
@@ -62,7 +60,7 @@ class Replay:
         return bool(self.causes) and self.causes[0].undecided
 
 
-def replay(source: Source, ticks: Ticks, others: Mapping[str, Controller] | None = None) -> Replay:
+def replay(source: Source, ticks: Ticks, others: Others | None = None) -> Replay:
     """Return how a law matches a log, and where it does not, why. `others`: laws that may have run in its place, by
     name.
     """
@@ -126,9 +124,7 @@ def _find_open(whole: Setting, match: Match, first: Cause | None) -> str | None:
     return join_words(find_unfollowed(whole, match)) or None
 
 
-def replay_stretches(
-    source: Source, row: Replay, longest: Ticks, whole: Ticks, others: Mapping[str, Controller]
-) -> Replay:
+def replay_stretches(source: Source, row: Replay, longest: Ticks, whole: Ticks, others: Others) -> Replay:
     """Return the replay of all stretches of a log with gaps, the longest of which is of the law, as `row` has it.
 
     Each begins in a state that the log does not have, and that its own first rows tell, as at the start of a log; what
@@ -158,7 +154,7 @@ def replay_stretches(
 
 
 def _read_counts(
-    whole: Setting, match: Match, others: Mapping[str, Controller]
+    whole: Setting, match: Match, others: Others
 ) -> tuple[Setting, Match, tuple[tuple[Cause, ...], Setting] | None]:
     """Return a setting that is met, and its match, with readings that are not rounded in the log if they are not; and
     what `find_causes` found, where that shows that they are not.

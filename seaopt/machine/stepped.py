@@ -20,7 +20,7 @@ integrals hold at the first of them, a polynomial, which is taken out of them fi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -57,6 +57,7 @@ INTEGRATES = 1e-6  # distance from 1 of a pole that does not decay
 LEVELS = 200  # of a reference that is taken for rounded; what has fewer is steps
 LONGEST_RESPONSE = 5000  # rows after which an impulse has left what the integrals hold of it
 Source = Controller | ScheduledController | ForceMPC
+Others = Mapping[str, Controller | ScheduledController]  # laws that may have run in a law's place, by name
 State = LawState | MPCState
 
 

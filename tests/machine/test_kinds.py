@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import LawState, MPCSpec, force_mpc, runnable, tune_schedule
+from seaopt.control import LawState, MPCSpec, ScheduledController, force_mpc, runnable, tune_schedule
 from seaopt.control.running.law_step import run_law
 from seaopt.machine.stepped import Setting
 from seaopt.machine.ticks import Ticks
@@ -178,3 +178,16 @@ def test_predictive_control_is_brought_up_with_less_effort(planned, tmp_path):
     assert (tmp_path / "stage_1" / "force_mpc.h").is_file()
     log = planned.log(Machine(), full.excitation.reference)
     assert so.accept(mpc, [log]).replayed and np.max(np.abs(log["I"])) < full.stop["I"]
+
+
+def test_an_older_gain_table_is_named_by_its_file(schedule, scheduled, compiler, tmp_path):
+    """As `seaopt accept` reads it from the folder, without its plant."""
+    older = tune_schedule(STAND, THOR, replace(schedule.controllers[0].spec, bandwidth_hz=20), "k", [5e5, 8e5])
+    read = ScheduledController.read(older.to_dict())
+    places = np.linspace(5e5, 8e5, REFERENCE.size)
+    log = Bench(compiler, tmp_path, older).log(Machine(), REFERENCE, places=places, decimals=2)
+    (row,) = so.accept(schedule, [log], others={"old/controller.json": read}).replays
+    assert not row.met and row.causes[0].explains
+    assert (row.causes[0].kind, row.causes[0].what) == ("another law", "old/controller.json")
+    right = scheduled.log(Machine(), REFERENCE, places=places)
+    assert so.accept(schedule, [right], others={"old/controller.json": read}).replayed

@@ -297,6 +297,21 @@ class ScheduledController(Result, Worded):
         }
 
     @classmethod
+    def read(cls, content: Mapping[str, Any]) -> ScheduledController:
+        """Return the schedule of a controller.json, without its design plant and what it achieves there."""
+        from seaopt.control.scheduling.stored import read_points  # deferred: pydantic
+
+        table, _, controllers = read_points(content)
+        return cls(
+            over=table.over,
+            unit=table.unit,
+            points=table.points,
+            controllers=tuple(controllers),
+            others={},
+            fallback=table.fallback,
+        )
+
+    @classmethod
     def from_dict(
         cls,
         content: Mapping[str, Any],
