@@ -99,7 +99,8 @@ TWO_AMPLITUDES = (
     "A limit of the drive and a smaller gain are told apart by a log at half the amplitude: a gain stays as it is."
 )
 IN_PART = (
-    "No row explains all of it. An interval holds where nothing but its row differs; the true size may be outside."
+    "No row explains all of it to the noise. An interval holds where nothing but its row differs; the true size may be "
+    "outside."
 )
 HIDDEN = (
     "In {} no tick is off by more than rounding allows, but all of them together are: what that cause makes stands out "
@@ -356,7 +357,7 @@ def _remark(differences: Differences) -> tuple[str, ...]:
         remarks.append(NOT_TOLD)
         if any(each.kind == "drive limit" for each in differences.found):
             remarks.append(TWO_AMPLITUDES)
-    if differences.found[0].explains < EXPLAINED:
+    if not differences.explained:
         remarks.append(IN_PART)
     return tuple(remarks)
 

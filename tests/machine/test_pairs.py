@@ -64,3 +64,24 @@ def test_a_limited_drive_beside_a_softer_spring(controller, bench):
 def test_one_fault_alone_has_no_second_beside_it(controller, bench, fault):
     found = accept(controller, bench.log(scale(**fault), REFERENCE, noise=0.5)).differences.found
     assert not any(each.beside for each in found), found
+
+
+@pytest.mark.parametrize("factor", [8.0, 40.0])
+def test_a_large_factor_has_no_second_fault_beside_it(controller, bench, factor):
+    """An end of what is tried, 4.5, was said with an interval, and a gain that is not off explained what it left."""
+    found = accept(controller, bench.log(scale(damping=factor), REFERENCE, noise=0.5)).differences.found
+    assert not any(each.beside for each in found), found
+    if factor < 20.0:
+        assert found[0].name == "b_r" and found[0].value == pytest.approx(factor, rel=0.01)
+    else:
+        assert all(each.low is None and each.high is None for each in found if each.name == "b_r")
+
+
+def test_two_faults_that_leave_more_than_noise_say_that_intervals_may_not_hold(controller, bench):
+    """Three faults: two explain 97 %, and neither interval holds the truth."""
+    machine = replace(scale(damping=2.0, per_ampere=0.8), delay_s=1.2e-3)
+    result = accept(controller, bench.log(machine, REFERENCE, noise=0.5))
+    assert result.differences.found[0].explains > 0.95 and not result.differences.explained
+    assert "the true size may be outside" in " ".join(str(result).split())
+    alone = accept(controller, bench.log(scale(damping=2.0), REFERENCE, noise=0.5))
+    assert alone.differences.explained

@@ -16,7 +16,7 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.machine.differences.comparison import TOLERATED, Comparison
-from seaopt.machine.differences.explanations import explain
+from seaopt.machine.differences.explanations import WORTH, explain
 from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
 from seaopt.machine.differences.size_fit import Difference
@@ -45,6 +45,11 @@ class Differences:
     nearest: Mapping[str, float]  # of the certificate's draws, the values of the one that is nearest
     nearest_misfit: float | None
     prediction: Prediction | None = None  # with dry friction
+
+    @property
+    def explained(self) -> bool:
+        """Whether the first difference leaves no more than twice what noise does, so that its interval holds."""
+        return bool(self.found) and (self.misfit - 1.0) * (1.0 - self.found[0].explains) <= WORTH - 1.0
 
 
 def compare(

@@ -267,7 +267,7 @@ def _try_rate(comparison: Comparison, values: ParameterSet, spread: Spread) -> I
             return
         leeway = spread.leave(find_slopes(at(log), spread, values, model))
         fit = SizeFit(comparison=comparison, leeway=leeway)
-        best = fit.solve(lambda x, model=model, slope=slope: model + x[0] * slope, [0.0], MOST_STEP)
+        best = fit.solve(lambda x, model=model, slope=slope: model + x[0] * slope, [0.0], [(-MOST_STEP, MOST_STEP)])
         log += float(best.sizes[0])
         if abs(best.sizes[0]) <= FOUND:
             break

@@ -17,7 +17,7 @@ from seaopt.records import record
 BEGUN = 2  # rounds of the search of each pair, before the best of them go on
 FIRST = 3  # single causes that a second is tried beside
 REFINED = 8  # pairs that are searched to the end
-MORE_ROUNDS = 2 * ROUNDS  # of a search along two sizes at once
+MORE_ROUNDS = ROUNDS  # of a search along two sizes at once
 HALVES = 0.5  # of what one cause leaves, that two are to leave at most
 
 
@@ -37,6 +37,9 @@ def find_pairs(
     """Return the pairs of causes that explain much more than the best single one, the best first, those that are as
     good beside it. `knobs`: of the second causes; `noise`: what it leaves of the misfit.
     """
+    best = min(starts, key=lambda start: start.single.left, default=None)
+    if best is None or best.single.difference.low is None:  # more of it than is tried may be all
+        return []
     late = [start for start in starts[FIRST:] if start.knob.kind == "delay"]  # what most often comes second
     searches = [(start, each) for start in (*starts[:FIRST], *late) for each in _begin(start, knobs, values, spread)]
     searches.sort(key=lambda pair: pair[1].best.left if pair[1].best else np.inf)
@@ -48,8 +51,7 @@ def find_pairs(
             break
         seen.append({*search.names})
         found += _search_on(start, search, values, spread)
-    least = min(start.single.left for start in starts)
-    found = [each for each in found if _is_worth(each, least, noise)]
+    found = [each for each in found if _is_worth(each, best.single.left, noise)]
     found.sort(key=lambda each: each.left)
     return _fold([each for each in found if each.is_untold(found[0], noise)])
 

@@ -86,8 +86,10 @@ class SizeFit:
     comparison: Comparison
     leeway: Leeway
 
-    def solve(self, make: Callable[[Any], Lines], start: Sequence[float], most: float = math.inf) -> Best:
-        """Return the best sizes of what makes a response of sizes. `most`: that they may be."""
+    def solve(
+        self, make: Callable[[Any], Lines], start: Sequence[float], ends: Sequence[tuple[float, float]] | None = None
+    ) -> Best:
+        """Return the best sizes of what makes a response of sizes. `ends`: between which each may be."""
         from scipy.optimize import least_squares  # deferred: 0.2 s
 
         k, leeway, measured = len(start), self.leeway, self.comparison.response
@@ -104,7 +106,8 @@ class SizeFit:
         if not first.size:
             left = 0.5 * float(np.sum(errors(first) ** 2))
             return Best(sizes=first, stds=first, left=left, response=respond(first))
-        edges = [np.concatenate([np.full(k, sign * most), ends]) for sign, ends in ((-1, leeway.low), (1, leeway.high))]
+        low, high = np.reshape(ends or [(-math.inf, math.inf)] * k, (k, 2)).T
+        edges = [np.concatenate([low, leeway.low]), np.concatenate([high, leeway.high])]
         scale = np.concatenate([np.maximum(np.abs(start), 1e-3), leeway.std])
         solved = least_squares(errors, first, x_scale=scale, bounds=edges, max_nfev=200)
         left, variances = float(solved.cost), np.diag(np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True))[:k]

@@ -18,10 +18,10 @@ from seaopt.records import record
 from seaopt.robustness.uncertainty.worst import place_values
 
 STEP = 0.02  # of a size, to see what it does
-ROUNDS = 4  # of Gauss and Newton
+ROUNDS = 8  # of Gauss and Newton
 FOUND = 1e-3  # a size is found where it moves by less
 MOST_STEP = 0.5  # of it, in a round
-MOST_LOG = 1.5  # of a factor: its logarithm goes no further
+MOST_LOG = 3.0  # of a factor: its logarithm goes no further
 MOST_SPREAD = 10.0  # of a factor's logarithm, above which the log does not tell the factor
 SURE = 1.96  # std, of 95 %
 
@@ -43,6 +43,11 @@ class Knob:
         """Between which its size lies."""
         return (0.0, math.inf) if self.kind == "delay" else (-MOST_LOG, MOST_LOG)
 
+    def limit(self, size: float) -> tuple[float, float]:
+        """Return between what its size may change in a round."""
+        low, high = self.ends
+        return max(low - size, -MOST_STEP), min(high - size, MOST_STEP)
+
     def place(self, values: ParameterSet, size: float) -> ParameterSet:
         """Return a plant's values with it."""
         late = self.sample_time_s * size
@@ -50,17 +55,27 @@ class Knob:
         return values.with_parameters(replace(self.parameter, value=value, min=-math.inf, max=math.inf))
 
     def describe(self, size: float, std: float) -> Difference:
-        """Return it as a difference, with its interval where the log tells it."""
+        """Return it as a difference, with its interval where the log tells it and its size is at no end of what is
+        tried.
+        """
         far = SURE * std
-        name = self.parameter.name
-        sizes = (size, size - far, size + far)
+        name = "delay" if self.kind == "delay" else self.parameter.name
+        told = far < MOST_SPREAD and all(abs(size - end) > FOUND for end in self.ends)
+        value, low, high = map(self._measure, (size, size - far, size + far))
+        return Difference(
+            kind=self.kind, name=name, unit=self._unit, explains=0.0,
+            value=value, low=low if told else None, high=high if told else None,
+        )  # fmt: skip
+
+    @property
+    def _unit(self) -> str:
+        return "-" if self.kind == "parameter" else self.parameter.unit
+
+    def _measure(self, size: float) -> float:
+        """Return a size in its unit."""
         if self.kind == "delay":
-            value, low, high = (self.sample_time_s * each for each in sizes)
-            return Difference(kind="delay", name="delay", value=value, low=low, high=high, unit="s", explains=0.0)
-        scale, unit = (self.parameter.value, self.parameter.unit) if self.kind == "drive limit" else (1.0, "-")
-        value, *edges = (scale * math.exp(min(each, MOST_SPREAD)) for each in sizes)
-        low, high = edges if far < MOST_SPREAD else (None, None)
-        return Difference(kind=self.kind, name=name, value=value, low=low, high=high, unit=unit, explains=0.0)
+            return self.sample_time_s * size
+        return (1.0 if self.kind == "parameter" else self.parameter.value) * math.exp(min(size, MOST_SPREAD))
 
 
 def make_delay(sample_time_s: float) -> Knob:
@@ -116,7 +131,17 @@ def refine(
         moving = [each for each, rests in zip(after, still, strict=True) if not rests]
         models = comparison.predict([each.place(values) for each in moving]) if moving else []
         moving = [replace(each, model=found) for each, found in zip(moving, models, strict=True)]
-    return [each for each in (*done, *moving) if each.best is not None]
+    done += [_judge_anew(comparison, spread, each) for each in moving]
+    return [each for each in done if each.best is not None]
+
+
+def _judge_anew(comparison: Comparison, spread: Spread, search: Search) -> Search:
+    """Return a search that moved to its last round with what its model leaves there, in place of a straight line's."""
+    if search.best is None:
+        return search
+    fit = SizeFit(comparison=comparison, leeway=spread.leave(search.slopes, *search.names))
+    there = fit.solve(lambda _: search.model, [])
+    return replace(search, best=replace(search.best, left=there.left, response=there.response))
 
 
 def step(comparison: Comparison, spread: Spread, values: ParameterSet, searches: Sequence[Search]) -> list[Search]:
@@ -130,8 +155,7 @@ def step(comparison: Comparison, spread: Spread, values: ParameterSet, searches:
             continue
         fit = SizeFit(comparison=comparison, leeway=spread.leave(each.slopes, *each.names))
         start = [0.0] * len(each.knobs)
-        best = fit.solve(lambda x, each=each, slopes=slopes: each.model + x @ slopes, start, MOST_STEP)
-        ends = np.array([knob.ends for knob in each.knobs])
-        sizes = np.clip(each.sizes + best.sizes, ends[:, 0], ends[:, 1])
-        changed.append(replace(each, sizes=sizes, best=best))
+        ends = [knob.limit(size) for knob, size in zip(each.knobs, each.sizes.tolist(), strict=True)]
+        best = fit.solve(lambda x, each=each, slopes=slopes: each.model + x @ slopes, start, ends)
+        changed.append(replace(each, sizes=each.sizes + best.sizes, best=best))
     return changed
