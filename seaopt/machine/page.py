@@ -228,9 +228,10 @@ def _say_mismatch(row: Replay, result: Acceptance) -> str:
         off = f"{off}, or lines of the reference lie above half of the log's rate"
     if not row.causes:
         return f"{off}; {MISSED}"
-    if len(row.causes) > 1 and row.causes[1].besides and row.causes[1].explains:
-        return f"{say_cause(row.causes[0])}, and {say_cause(row.causes[1])}"
-    return f"{off}; nearest: {say_cause(row.causes[0])} ({100.0 * row.causes[0].removes:.0f} % of it)"
+    first, *others = row.causes
+    if others and others[0].besides and others[0].explains:
+        return f"{say_cause(first)}, and {say_cause(others[0])}"
+    return f"{off}; nearest: {say_cause(first)} ({100.0 * first.removes:.0f} % of it)"
 
 
 def describe(result: Acceptance) -> list[Section]:

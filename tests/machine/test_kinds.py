@@ -10,6 +10,8 @@ import pytest
 import seaopt as so
 from seaopt.control import LawState, MPCSpec, ScheduledController, force_mpc, runnable, tune_schedule
 from seaopt.control.running.law_step import run_law
+from seaopt.machine.design_run import run_design
+from seaopt.machine.free_gains import read_gains
 from seaopt.machine.stepped import Setting
 from seaopt.machine.ticks import Ticks
 from tests.machine.simulator import Bench, Machine, multisine
@@ -191,3 +193,30 @@ def test_an_older_gain_table_is_named_by_its_file(schedule, scheduled, compiler,
     assert (row.causes[0].kind, row.causes[0].what) == ("another law", "old/controller.json")
     right = scheduled.log(Machine(), REFERENCE, places=places)
     assert so.accept(schedule, [right], others={"old/controller.json": read}).replayed
+
+
+def test_a_cascade_is_replayed_and_another_set_of_its_gains_is_named():
+    plant = so.plants.rotary(link="locked")
+    stated = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "k_s": 300.0}
+    values = plant.complete(so.ParameterSet()).update(**stated)
+    measured = ("tau_s", "thetad_m")
+    spec = so.ControllerSpec(bandwidth_hz=20, structure="cascade", measured=measured, current_limit_A=9.0)
+    law = so.tune(plant, values, spec)
+    reference = multisine(1000, LINES, 6, 1.0, 3, bias=2.0)
+
+    def play(law):
+        run = run_design(law, [values], reference)
+        columns = {name: run.outputs[name][0][:-1] for name in law.signals} | {"reference": reference[:-1]}
+        # The command of a row is put out in the next one.
+        return so.Log.from_arrays(time=1e-3 * np.arange(reference.size - 1), I=run.current[0][1:], **columns)
+
+    (row,) = so.accept(law, [play(law)]).replays
+    assert row.met and row.command_late == 0 and row.mismatch < 1e-9
+    gains = read_gains(law)
+    other = replace(
+        gains, k_p=0.7 * gains.k_p, k_i=1.3 * gains.k_i, inner=replace(gains.inner, k_v=0.8 * gains.inner.k_v)
+    )
+    made = replace(law, law=other.law("cascade", 1e-3).balanced(), gains=other.by_name())
+    (row,) = so.accept(law, [play(made)]).replays
+    assert (row.causes[0].kind, row.causes[0].explains) == ("gains", True)
+    assert row.causes[0].gains == pytest.approx(other.by_name(), rel=1e-4)
