@@ -94,12 +94,12 @@ def _average(u: Any, model: Any, error: Any, period: float, starts: Any, length:
     f = np.fft.rfftfreq(length, period)
     last = int(np.searchsorted(f, highest)) + 1
     window, rows = welch.hann(length), np.asarray(starts)[:, None] + np.arange(length)
-    uf, *others = (welch.transform(x[rows], window)[:, 1 : last + 1] for x in (u, *model, *error))
+    uf, *spectra = (welch.transform(x[rows], window)[:, 1 : last + 1] for x in (u, *model, *error))
     power = np.maximum(np.sum(welch.square(uf), axis=0), 1e-300)
-    outputs, y, rest = np.array(others), len(model), welch.count_averages(len(starts)) - 1.0
+    outputs, y, freedom = np.array(spectra), len(model), welch.count_averages(len(starts)) - 1.0
     response = np.sum(np.conj(uf) * outputs, axis=1) / power
     left = outputs - response[:, None] * uf
-    each = np.einsum("idm,jdm->ijm", left[y:], np.conj(left[y:])) / rest
+    each = np.einsum("idm,jdm->ijm", left[y:], np.conj(left[y:])) / freedom
     near = uniform_filter1d(np.real(each), NEAR, mode="nearest") + 1j * uniform_filter1d(
         np.imag(each), NEAR, mode="nearest"
     )
@@ -115,8 +115,8 @@ def _average(u: Any, model: Any, error: Any, period: float, starts: Any, length:
         error=e[:, inner],
         noise=(near / power)[..., inner],
         unseen=UNSEEN * bend[:, inner],
-        rough=(np.sum(welch.square(left[:y]), axis=1) / power / rest)[:, inner],
-        freedom=rest * NEAR / ALIKE,
+        rough=(np.sum(welch.square(left[:y]), axis=1) / power / freedom)[:, inner],
+        freedom=freedom * NEAR / ALIKE,
     )
 
 

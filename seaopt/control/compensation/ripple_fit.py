@@ -92,7 +92,9 @@ class RippleFit:
     def to_toml(self, fraction: float = RIPPLE_FRACTION) -> str:
         """Return the line for [controller] of a problem file."""
         lists = {"cycles": self.cycles, "cos": self.cos, "sin": self.sin}
-        keys = ", ".join(f"{name} = [{', '.join(f'{one:.6g}' for one in values)}]" for name, values in lists.items())
+        keys = ", ".join(
+            f"{name} = [{', '.join(f'{value:.6g}' for value in values)}]" for name, values in lists.items()
+        )
         return f"compensate = {{ ripple = {{ {keys}, fraction = {fraction:g}, period = {self.period:.12g} }} }}"
 
     def __repr__(self) -> str:

@@ -109,9 +109,9 @@ def sweep_schedule(
         return [_tune_row(swept, spec, part) for spec, part in zip(specs, parts, strict=True)]
     found: list[tuple[FrontierRow, ScheduledController]] = []
     done = map_ordered(partial(_tune_part, Shared(swept)), specs, executor)
-    for spec, part, one in zip(specs, parts, done, strict=True):
+    for spec, part, row_and_law in zip(specs, parts, done, strict=True):
         part(f"{spec.bandwidth_hz:g} Hz", 1.0)
-        found.append(one)
+        found.append(row_and_law)
     return found
 
 

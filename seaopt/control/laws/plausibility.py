@@ -201,9 +201,9 @@ class Agreement:
             least = getattr(plant.parameters[parameter.name], "min", -math.inf) + 1e-6 * abs(parameter.value)
             for end in (max(parameter.value - SIGMAS * std, least), parameter.value + SIGMAS * std):
                 moved = replace(parameter, value=end, min=-math.inf, max=math.inf)
-                others, lead = _weigh(plant, params.with_parameters(moved), regulated, names)
-                part = float(others @ weights / (weights @ weights)) - 1.0
-                if np.max(np.abs(others - (1.0 + part) * weights)) > 1e-6 * np.max(np.abs(weights)):
+                varied, lead = _weigh(plant, params.with_parameters(moved), regulated, names)
+                part = float(varied @ weights / (weights @ weights)) - 1.0
+                if np.max(np.abs(varied - (1.0 + part) * weights)) > 1e-6 * np.max(np.abs(weights)):
                     raise ControlError(
                         f"agreement: {parameter.name} has a std, and changes what one encoder says against the other; "
                         "give its value"

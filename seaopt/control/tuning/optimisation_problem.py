@@ -262,20 +262,20 @@ class Task:
         Without an integral k_r is fixed, for a static gain of 1.
         """
         spec, ts, integrates = self.spec, self.spec.sample_time_s, self.integrates(x)
-        fixed, free, one = (0.0, 0.0), (0.0, np.inf), (1.0, 1.0)
+        fixed, free, unused = (0.0, 0.0), (0.0, np.inf), (1.0, 1.0)
 
         def warp(corner_hz: float | None, lowest: float) -> tuple[float, float]:
             low, high = _range(corner_hz, lowest * spec.bandwidth_hz, HIGHEST_CORNER / ts)
             return warp_frequency(low, ts), warp_frequency(high, ts)
 
-        notch, prefilter = ((0.1, 0.1), (0.5, 0.5), one), (one, one)
+        notch, prefilter = ((0.1, 0.1), (0.5, 0.5), unused), (unused, unused)
         fastest = (spec.level("min_filter_samples") or 0.0) * ts
         if spec.notch is not None:
             width, depth = _range(spec.notch.width, 0.02, 1.0), _range(spec.notch.depth, 0.01, 1.0)
             notch = (warp(spec.notch.frequency_hz, LOWEST_NOTCH), width, depth)
         low_pass = spec.reference_filter
         if low_pass is not None:
-            damping = _range(low_pass.damping, *PREFILTER_DAMPING) if low_pass.is_second_order else one
+            damping = _range(low_pass.damping, *PREFILTER_DAMPING) if low_pass.is_second_order else unused
             prefilter = (warp(low_pass.corner_hz, LOWEST_PREFILTER), damping)
         ranges = [
             free, free if integrates else fixed, free,
@@ -283,7 +283,7 @@ class Task:
             free if spec.reference_weights != "error" else fixed,
             free if self.speed_loop is not None else fixed,
             (fastest, max(fastest, 4.0 / (2 * np.pi * spec.bandwidth_hz))),
-            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else one,
+            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else unused,
             (SLOWEST_SPEED_RATE, 1.0 / ts) if self.speed_loop is not None and x[SPEED_RATE] > 0.0 else fixed,
             *notch, *prefilter,
         ]  # fmt: skip

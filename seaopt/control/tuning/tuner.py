@@ -176,11 +176,11 @@ def _describe_request(
 ) -> str:
     """Return what it takes to repeat a call."""
     values = params.parameters if isinstance(params, Fit) else params
-    others = {name: (plant[0] if isinstance(plant, tuple) else plant).name for name, plant in robust_to.items()}
+    named = {name: (plant[0] if isinstance(plant, tuple) else plant).name for name, plant in robust_to.items()}
     numbers = {name: parameter.value for name, parameter in values.items()}
     return (
         f"plant: {plant.name}; parameters: {numbers}; specification: {spec.to_dict()}; "
-        f"robust_to: {others}; draws: {[dict(values) for values in draws]}"
+        f"robust_to: {named}; draws: {[dict(values) for values in draws]}"
     )
 
 

@@ -128,7 +128,7 @@ def _write_matrices(
     inputs = [*reads.values(), *([] if command is None else [command])]
     x, y, step = (ca.vertcat(*parts) for parts in (kept.values(), inputs, ((moved | after)[name] for name in kept)))
     a, b, c, d = (ca.jacobian(of, by) for of in (step, effort) for by in (x, y))
-    used = _find_used(*(np.array(ca.DM(one.sparsity(), 1.0)) != 0.0 for one in (a, b, c)))
+    used = _find_used(*(np.array(ca.DM(matrix.sparsity(), 1.0)) != 0.0 for matrix in (a, b, c)))
     parts = a[used, used], b[used, :], c[:, used], d
     return ca.Function("law", [value], [ca.densify(part) for part in parts]), _list_blocks(parts[0])
 
@@ -203,12 +203,12 @@ def add_polynomials(parts: Sequence[Taylor]) -> Taylor:
     return out
 
 
-def multiply_polynomials(one: Taylor, other: Taylor) -> Taylor:
+def multiply_polynomials(left: Taylor, right: Taylor) -> Taylor:
     """Return the product of polynomials whose coefficients, ascending along the last axis, are models."""
-    count, size = one.c.shape[0], one.c.shape[1] + other.c.shape[1] - 1
-    out = make_constant(np.zeros((count, size)), one.basis)
-    for k in range(one.c.shape[1]):
-        part, at = one[:, k : k + 1] * other, slice(k, k + other.c.shape[1])
+    count, size = left.c.shape[0], left.c.shape[1] + right.c.shape[1] - 1
+    out = make_constant(np.zeros((count, size)), left.basis)
+    for k in range(left.c.shape[1]):
+        part, at = left[:, k : k + 1] * right, slice(k, k + right.c.shape[1])
         out.a[:, :, at] += part.a
         out.r[:, at] += part.r
     return out

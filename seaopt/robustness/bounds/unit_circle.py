@@ -185,10 +185,10 @@ def expand_controller(controller: Controller) -> LawPolynomials:
 
 def expand_nothing(controller: Controller) -> LawPolynomials:
     """Return the polynomials beside a plant that has the law of a controller in front of it."""
-    one, signals = np.ones(1), len(controller.signals)
+    constant, signals = np.ones(1), len(controller.signals)
     return LawPolynomials(
-        numerators=(one,) * signals,
-        denominator=one,
+        numerators=(constant,) * signals,
+        denominator=constant,
         through=(1.0,) * signals,
         delay_samples=controller.compute_delay_samples,
     )
