@@ -90,7 +90,7 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "nothing else": {},
     "`notch`": {"CONTROLLER": "notch = true"},
     "`prefilter`": {"CONTROLLER": 'prefilter = "second_order"'},
-    "`link_feedforward`": {"CONTROLLER": "link_feedforward = true", "ROBUST_TO": '"swing"'},
+    "`link_feedforward`": {"CONTROLLER": "link_feedforward = true", "ROBUST_TO": '"swing"', "CERTIFIED": '"swing"'},
     "friction, from the reference": {"CONTROLLER": "compensate = { friction = { fraction = 0.4 } }", "COULOMB": "0.002"},
     "friction, from the speed": {"CONTROLLER": 'compensate = { friction = { fraction = 0.4, from = "speed" } }', "COULOMB": "0.002"},
     "weight of the link": {"CONTROLLER": 'compensate = { gravity = { plant = "swing", fraction = 0.8 } }', "CERTIFIED": '"swing"'},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -205,6 +206,33 @@ def test_a_design_on_a_response_is_tuned_again_at_draws_of_the_models_it_is_cert
     problem = so.read_problem(path)
     with pytest.raises(ProblemError, match=r"name models in plants of \[robustness\]"):
         tune_problem(problem, problem.parameters)
+
+
+@pytest.mark.slow
+def test_a_design_on_a_response_takes_the_motion_of_the_link_of_a_model(tmp_path):
+    """The link of the stand stands still in its log: there the law is as without it, and on the swing it helps."""
+    path = tmp_path / "knee.toml"
+    plain = WARM.replace("derate = true", 'robust_to = ["swing"]').replace("gate = { range_N = [-300, 300] }", "")
+    plain = re.sub(r"compensate = .*", "", plain)
+    laws = []
+    for text in (plain, plain.replace("max_noise", "link_feedforward = true\nmax_noise")):
+        path.write_text(text)
+        problem = so.read_problem(path)
+        laws.append(tune_problem(problem, problem.parameters))
+        assert laws[-1].met and laws[-1].design is None
+    _, fed = laws
+    assert fed.link is not None and fed.link.measured == "theta_l"
+    swing, z = problem.plants["swing"], np.exp(2j * np.pi * np.geomspace(0.05, 499.0, 20_000) * 1e-3)
+    loop = fed.close(fed.see(swing), problem.parameters)
+    assert np.max(np.abs(loop.eigenvalues())) < 1.0
+    assert np.max(np.abs(loop.to_control()(z)[0, 0])) <= 1.7 * 1.001
+    response = list_plants(problem, problem.parameters)[0]
+    again = so.Controller.from_dict(json.loads(so.files.to_json(fed.to_dict())), response, problem.parameters)
+    assert again.link == fed.link and again.achieved.ms == pytest.approx(fed.achieved.ms, rel=1e-9)
+    certificate = certify_problem(problem, fed, problem.parameters)
+    assert set(certificate.plants) >= {"swing sliding"} and certificate.simulated.verification.rows
+    narrow = [law.close(law.see(swing), problem.parameters).figures().tracking_band_hz[0] for law in laws]
+    assert narrow[1] < narrow[0]  # the swinging link hinders tracking from further down
 
 
 def test_what_feeds_the_motor_back_is_refused_where_the_loop_is_measured(tmp_path):

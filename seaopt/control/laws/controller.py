@@ -284,7 +284,8 @@ class Controller(ClosesLoops, Result, Worded):
         """The same with the model of what was measured as its design plant, where that is a measured response."""
         if self.design is not None or self.measured_on is None:
             return self
-        return replace(self, design=self.measured_on, designed_on_response=True)
+        plant, params = self.measured_on
+        return replace(self, design=(self.see(plant), params), designed_on_response=True)
 
     @property
     def judged_on(self) -> str:

@@ -267,7 +267,7 @@ def make_task(
             raise ControlError(f"robust_to: {name} is a tuple of {len(pair)}; give a plant, or (plant, parameters)")
         require_plant(pair[0], f"robust_to: {name}", ControlError)
         named[str(name)] = (pair[0], place_drive_delay(spec, pair[1], late)) if pair is other else pair
-    link = _find_link(spec, named, bool(first), gain)
+    link = _find_link(spec, named, gain)
     if link is not None:
         named = {name: (link.see(model), params) for name, (model, params) in named.items()}
         design, signals = link.see(design), (*signals, link.measured)
@@ -329,19 +329,14 @@ def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
 
 
 def _find_link(
-    spec: ControllerSpec, named: Mapping[str, tuple[Plant, ParameterSet]], on_response: bool, per_effort: float
+    spec: ControllerSpec, named: Mapping[str, tuple[Plant, ParameterSet]], per_effort: float
 ) -> LinkPath | None:
     """Return the path from the link's motion, of the first plant whose link moves; None where none is requested. Raises
-    ControlError: no plant has such a signal, or the design plant is a measured response.
+    ControlError: no plant has such a signal.
     """
     feedforward = spec.link_feedforward
     if feedforward is None:
         return None
-    if on_response:
-        raise ControlError(
-            "link_feedforward takes a model of the design plant, as a law of a measured response is certified on such "
-            "responses alone, whose links stand still; design on a model, and name the response in robust_to"
-        )
     for model, values in named.values():
         if name_link_signal(feedforward, model) is not None:
             return model_link_path(feedforward, model, values, spec.regulated, per_effort, spec.bandwidth_hz)
@@ -508,7 +503,7 @@ def describe_law(
         active_constraints=tuple(broken or list_active(spec, verdicts)),
         robust_to=task.names[task.design_states :],
         design=None if isinstance(plant, MeasuredResponse) else (plant, params),
-        measured_on=(plant.plant, params) if isinstance(plant, MeasuredResponse) else None,
+        measured_on=(name_design(plant), params) if isinstance(plant, MeasuredResponse) else None,
         observer=observer,
         blocked_by=tuple(_explain_rest(task, text) for text in explanations),
         possible=None if not broken else possible,

@@ -205,7 +205,7 @@ def certify(
     if not simulations and (sensors is not None or command_step):
         raise ControlError("sensors and command_step are of the simulations, which are left out; give simulations=True")
     if law.design is None:
-        _check_responses(plants, measured or {})
+        _check_responses(law, plants, measured or {})
     else:
         check_sensors(sensors, law, {"design": law.design[0], **plants})
     others, certified = others or ParameterSet(), subject if isinstance(subject, ScheduledController) else law
@@ -241,8 +241,17 @@ def _take_law(subject: Any) -> Controller:
     return subject
 
 
-def _check_responses(plants: Plants, measured: Mapping[str, MeasuredResponse]) -> None:
-    """Refuse models, or no response, of a controller that was designed on a measured response."""
+def _check_responses(law: Controller, plants: Plants, measured: Mapping[str, MeasuredResponse]) -> None:
+    """Refuse models, or no response, of a controller that was designed on a measured response, and responses alone of
+    one that reads the motion of a link.
+    """
+    weighs = law.compensation is not None and law.compensation.gravity is not None
+    reads = "link_feedforward" if law.link is not None else "compensate.gravity" if weighs else ""
+    if not plants and reads:
+        raise ControlError(
+            f"{reads} reads the motion of a link, of which a measured response says nothing; name the plant whose link "
+            "moves in plants of [robustness]"
+        )
     if plants:
         raise ControlError(
             f"the controller was designed on a measured response, and plants names {', '.join(plants)}; "

@@ -327,8 +327,9 @@ def test_a_response_of_a_moving_link_is_refused(beside_discs, stand, swing, thor
         so.tune(stand, thor, controller.spec, {"swing": swing, "log": moving})
     with pytest.raises(ControlError, match="whose link moves"):
         so.certify(controller, {"swing": swing}, thor, measured={"log": moving})
-    with pytest.raises(ControlError, match="model of the design plant"):
-        so.tune(response, thor, controller.spec, {"swing": swing})
+    alone = replace(controller, design=None, measured_on=(stand, thor))
+    with pytest.raises(ControlError, match="link_feedforward reads the motion of a link"):
+        so.certify(alone, {}, thor, measured={"log": response})
 
 
 def test_the_path_has_the_inertia_and_the_damping_of_the_motor_on_the_link():
