@@ -106,7 +106,7 @@ def fit_gains(setting: Setting) -> Gains | None:
     names, first = list(numbers.times), np.log(list(numbers.times.values()))
 
     def solve(z: Float[np.ndarray, " t"]) -> tuple[Gains, Float[np.ndarray, " n"]]:
-        return _project(setting, stretches, numbers, dict(zip(names, np.exp(z), strict=True)))
+        return _project(setting, stretches, numbers, dict(zip(names, np.exp(z).tolist(), strict=True)))
 
     best: tuple[float, Gains] | None = None
     for factor in STARTS:
