@@ -9,14 +9,16 @@ integration steps as coarse as the residual allows, and ends where it comes back
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.second_log import find_excess
-from seaopt.estimation.problem.fit_problem import Evaluation
+from seaopt.estimation.problem.fit_problem import BudgetError, Evaluation, count_left
 from seaopt.estimation.result.covariance import measure_colour
-from seaopt.estimation.result.findings import FitFinding
+from seaopt.estimation.result.findings import FitFinding, find_ended_start
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import LITTLE
 from seaopt.estimation.solver.settle import Solved, coarsen, measure_misfit, refine_to, settle_roughly
@@ -30,7 +32,9 @@ RETURNED = 0.25  # of that, within which a search is back
 
 
 def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
-    """Yield that another start ends elsewhere; tried where values are told apart weakly, or a residual is not noise."""
+    """Yield that another start ends elsewhere, or that it was left before its end; tried where values are told apart
+    weakly, or a residual is not noise.
+    """
     minimum = fit.require_minimum("find_other_minimum")
     problem = minimum.problem
     excess = max((find_excess(fit, e.plant.name) for e in fit.experiments), default=0.0)
@@ -42,9 +46,11 @@ def find_other_minimum(fit: Fit) -> Iterator[FitFinding]:
     colour = measure_colour(fit.covariance, fit.white_covariance)
     try:
         there = problem.evaluate(minimum.z)
-        solved = _search(fit, minimum, 2.0 * ENOUGH * colour)
+        solved, ended = _search(fit, minimum, 2.0 * ENOUGH * colour)
     except SeaoptError:  # what cannot be simulated is no minimum
         return
+    if ended:
+        yield find_ended_start()
     if solved is None or not np.isfinite(solved.misfit):
         return
     gain = 0.5 * (measure_misfit(there) - solved.misfit) / colour
@@ -77,9 +83,10 @@ def _find_moved(fit: Fit, values: Mapping[str, float], scale: float = 1.0) -> li
     return moved
 
 
-def _search(fit: Fit, minimum: Minimum, worse: float) -> Solved | None:
+def _search(fit: Fit, minimum: Minimum, worse: float) -> tuple[Solved | None, bool]:
     """Return the better minimum from the given values, and from the fit's off by a factor, up and down in turn; None
-    where both come back to the fit, or to a misfit that with the same steps is by so much `worse` than there.
+    where both come back to the fit, or to a misfit that with the same steps is by so much `worse` than there. With it,
+    whether no evaluation was left before both had ended.
     """
     coarse, there = coarsen(minimum.problem, minimum.z)
     unknowns = coarse.unknowns
@@ -88,16 +95,20 @@ def _search(fit: Fit, minimum: Minimum, worse: float) -> Solved | None:
     def comes_back(evaluation: Evaluation) -> bool:
         return not _find_moved(fit, unknowns.by_name(evaluation.z), RETURNED)
 
-    solved: list[Solved] = []
-    for values in (unknowns.start[: unknowns.shared], minimum.z[: unknowns.shared] * factors):
+    def search_from(values: Float[np.ndarray, " n"]) -> Solved | None:
         start = minimum.z.copy()
         start[: unknowns.shared] = values
         evaluation = coarse.evaluate(np.clip(start, unknowns.low, unknowns.high))
         found = settle_roughly(coarse, evaluation, ends=comes_back, checked=True)
         if found.misfit > measure_misfit(there) + worse:
-            continue
+            return None
         if not comes_back(found.solution.evaluation):
             found = refine_to(found, minimum.problem, comes_back)
-        if not comes_back(found.solution.evaluation):
-            solved.append(found)
-    return min(solved, key=lambda each: each.misfit, default=None)
+        return None if comes_back(found.solution.evaluation) else found
+
+    solved: list[Solved] = []
+    with suppress(BudgetError):
+        for values in (unknowns.start[: unknowns.shared], minimum.z[: unknowns.shared] * factors):
+            if (found := search_from(values)) is not None:
+                solved.append(found)
+    return min(solved, key=lambda each: each.misfit, default=None), count_left() < 1.0

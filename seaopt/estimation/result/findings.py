@@ -128,6 +128,17 @@ def find_ended_search(evaluations: float) -> FitFinding:
     )
 
 
+def find_ended_start() -> FitFinding:
+    """Return a note that a search from another start has made all evaluations that it may, before its end."""
+    return FitFinding(
+        severity="note",
+        kind="budget",
+        where="",
+        text="a search from another start was ended by its budget of evaluations: whether it ends elsewhere is not "
+        "known; a fit from other values of your own tells",
+    )
+
+
 def find_energy(fit_percent: float) -> float:
     """Return the share of an output's energy that a fit percent stands for."""
     return max(1.0 - (1.0 - fit_percent / 100.0) ** 2, 0.0)

@@ -7,6 +7,7 @@ import numpy as np
 
 import seaopt as so
 from seaopt.estimation.judgement import another_start
+from seaopt.estimation.problem.fit_problem import limit_evaluations
 
 N = 4000
 WAVE = so.Plant(
@@ -37,6 +38,17 @@ def test_a_start_in_a_higher_lobe_is_told_of_the_lowest():
     assert finding.severity == "error" and not fit.met
     assert abs(finding.preferred["a"][0] - 1.0) < 0.01
     assert "explains the logs better" in finding.text
+
+
+def test_a_search_that_is_left_before_its_end_says_so_and_keeps_what_it_found():
+    fit = fit_from(1.45)
+    kinds = []
+    for most in (3, 6, 10, 20, 40, 80):
+        with limit_evaluations(most):
+            kinds.append([each.kind for each in another_start.find_other_minimum(fit)])
+    assert kinds[0] == ["budget"] and kinds[-1] == ["starts"]
+    found = [("starts" in each) for each in kinds]
+    assert found == sorted(found)  # what fewer evaluations found, more do not lose
 
 
 def test_the_lowest_lobe_is_not_doubted():
