@@ -107,6 +107,12 @@ class Subject:
             "spring 20 % softer": ("law", lower, None, (("parameter", names["stiffness"]),)),
             "sign": ("law", replace(machine, reading_sign=-1.0), None, (("sign", signal),)),
             "saturated sensor": ("law", replace(machine, sensor_range=0.6 * peak[signal]), None, (("range", signal),)),
+            "drive limited": (
+                "law",
+                replace(machine, drive_limit=0.5 * peak["I"]),
+                None,
+                (("drive limit", "drive_limit"),),
+            ),
             "missing feedforward": ("bare", machine, None, (("feedforward", "reference"),)),
             "another controller": ("slower", machine, None, (("another law", OLD),)),
         }

@@ -10,6 +10,9 @@ import pytest
 import seaopt as so
 from tests.machine.simulator import Machine
 from tests.machine.test_drive_limit import REFERENCE
+from tests.machine.test_response import FRICTION, dry
+
+__all__ = ["dry"]  # a fixture
 
 RIGHT = Machine()
 RANGES = {"eta": (0.98, 1.02), "b_r": (0.95 * 1.31e-4, 1.05 * 1.31e-4)}
@@ -51,6 +54,16 @@ def test_a_later_loop_and_another_fault_are_named_together(controller, bench, fa
         text = " ".join(str(result).split())
         assert " ms later than certified" in text and ", and " in text
     assert np.sum(np.square(off)) < 10.6, off  # chi square of 2, 99.5 %
+
+
+@pytest.mark.slow
+def test_more_dry_friction_and_a_later_loop_are_named_together(dry):
+    """One alone has another size: the delay by itself excludes the true one."""
+    bench, reference = dry
+    machine = replace(Machine(), coulomb=2.0 * FRICTION, smoothing=5e-3, delay_s=0.7e-3)
+    first = so.accept(bench.controller, [bench.log(machine, reference, noise=0.5)]).differences.found[0]
+    delay, friction = find_part(first, "delay")[0], find_part(first, "f_c")
+    assert delay.low <= 0.7e-3 <= delay.high and abs(friction[1] / 2.0 - 1.0) < 0.05, first
 
 
 def test_a_limited_drive_beside_a_softer_spring(controller, bench):

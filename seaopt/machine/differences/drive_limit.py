@@ -103,13 +103,14 @@ def find_distortion(comparison: Comparison, logs: Sequence[Ticks], sets: Sequenc
     """
     measured = join_blocks([cut_periods(comparison.controller, ticks) for ticks in logs])
     return [
-        sum(_compare(there.average(), here.average()) for there, here in zip(groups, measured, strict=True))
+        sum(map(_compare, groups, measured)) if len(groups) == len(measured) else math.inf
         for groups in comparison.simulate(sets)
     ]
 
 
 def _compare(model: Blocks, measured: Blocks) -> float:
     """Return the sum of squares by which two differ between the lines, of the sets of phases that both have."""
+    model, measured = model.average(), measured.average()
     _, first, second = np.intersect1d(model.realisation, measured.realisation, return_indices=True)
     size = min(model.between.shape[1], measured.between.shape[1])
     off: Float[np.ndarray, "b k"] = np.abs(model.between[first, :size] - measured.between[second, :size])

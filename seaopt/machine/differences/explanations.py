@@ -48,9 +48,8 @@ from seaopt.records import record
 
 RIVAL = 20.0  # times what the best parameter leaves: parameters whose leeway is looked at where they are
 WORTH = 2.0  # times what noise leaves: a misfit above has causes
-ALIKE = (
-    2.0  # times what the best of some causes leaves of other outputs, or between the lines: these go with it as well
-)
+ALIKE = 2.0  # times what the best of some causes leaves of other outputs, or between the lines: they go with it too
+EVERY = 0.75  # of the law's rate, above which a log has each of its ticks
 HALF = 0.5  # of what the best cause explains, and of what a gain does, from which on others are looked at
 MODE_DAMPINGS = (0.02, 0.1)
 SEEN = 5.0  # std by which a line differs where a mode is looked for
@@ -118,7 +117,8 @@ def explain(
         tried = [limit, *tried] if told else sorted((*tried, limit), key=lambda each: each.rank)
     kinds = _group(tried, noise)
     if tried[0].left > WORTH * noise:
-        pairs = find_pairs(_list_starts(case, kinds, limit), _list_knobs(case), values, spread, noise)
+        least, starts = min(each.left for each in tried), _list_starts(case, kinds, limit)
+        pairs = find_pairs(starts, _list_knobs(case), values, spread, (least, noise))
         kinds = [*([pair] for pair in pairs), *kinds]
     return _list_found(case, kinds, told=told)
 
@@ -162,13 +162,16 @@ def _list_found(case: Case, kinds: Sequence[list[Tried]], *, told: bool) -> list
 
 def _try_limit(case: Case, tried: Sequence[Tried]) -> tuple[Tried | None, bool]:
     """Return a limit of the drive where a smaller gain explains much, or nothing explains all, and the log does not
-    exclude the limit; and whether what lies between the lines tells it from the best of what was tried.
+    exclude the limit; and whether what lies between the lines tells it from the best of what was tried, which leaves no
+    less than it.
     """
     smaller = any(
         each.difference.kind == "gain" and 0.0 < each.difference.value < 1.0 and each.left <= HALF * case.before
         for each in tried
     )
-    if not smaller and tried[0].left <= WORTH * case.noise:
+    period = case.comparison.controller.sample_time_s
+    every_tick = all(ticks.rate_hz * period > EVERY for ticks in case.logs)
+    if not every_tick or (not smaller and tried[0].left <= WORTH * case.noise):
         return None, False
     limited, best = take_limited(case.comparison, case.logs), tried[0]
     limit = try_limit(limited, case.values, case.spread)
@@ -177,9 +180,11 @@ def _try_limit(case: Case, tried: Sequence[Tried]) -> tuple[Tried | None, bool]:
     (its,) = find_distortion(limited, case.logs, [limit.values])
     unlimited = replace(limited, controller=case.comparison.controller)
     (others,) = find_distortion(unlimited, case.logs, [best.values or case.values])
+    if not math.isfinite(its + others):  # nothing lies between the lines
+        return limit, False
     if others * ALIKE <= its:
         return None, False
-    return limit, its * ALIKE <= others
+    return limit, its * ALIKE <= others and limit.is_untold(best, case.noise)
 
 
 def _list_knobs(case: Case) -> list[Knob]:

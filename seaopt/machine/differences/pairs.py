@@ -32,10 +32,10 @@ class Start:
 
 
 def find_pairs(
-    starts: Sequence[Start], knobs: Sequence[Knob], values: ParameterSet, spread: Spread, noise: float
+    starts: Sequence[Start], knobs: Sequence[Knob], values: ParameterSet, spread: Spread, left: tuple[float, float]
 ) -> list[Tried]:
     """Return the pairs of causes that explain much more than the best single one, the best first, those that are as
-    good beside it. `knobs`: of the second causes; `noise`: what it leaves of the misfit.
+    good beside it. `knobs`: of the second causes; `left`: of the misfit by the best single cause, and by noise.
     """
     best = min(starts, key=lambda start: start.single.left, default=None)
     if best is None or best.single.difference.low is None:  # more of it than is tried may be all
@@ -51,7 +51,8 @@ def find_pairs(
             break
         seen.append({*search.names})
         found += _search_on(start, search, values, spread)
-    found = [each for each in found if _is_worth(each, best.single.left, noise)]
+    least, noise = left
+    found = [each for each in found if _is_worth(each, least, noise)]
     found.sort(key=lambda each: each.left)
     return _fold([each for each in found if each.is_untold(found[0], noise)])
 
@@ -111,6 +112,7 @@ def _fold(pairs: Sequence[Tried]) -> list[Tried]:
 
 
 def _name_parts(difference: Difference) -> Mapping[str, Difference]:
+    """Return both causes of a pair by their names."""
     return {part.name: part for part in (difference, *difference.beside)}
 
 
