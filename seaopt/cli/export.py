@@ -54,7 +54,7 @@ def export_controller(
     if derate_margin_K is not None:  # without a guard `export` says what is missing
         options["derate"] = read_guard(content, derate_margin_K) or True
     options["gate"] = choose_gate(content, gate or {}, options)
-    failed = _list_broken_requirements(path, certificate)
+    failed = list_broken_requirements(path, certificate)
     options["uncertified"] = (
         "seaopt certify was not run on this law"
         if failed is None
@@ -245,7 +245,7 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
     return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h", *code.parts))
 
 
-def _list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:
+def list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:
     """Return the requirements that the certificate of this controller says are not met; None without a certificate.
     Raises SeaoptError: the certificate was edited or written by hand, or is of another controller.
     """

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from seaopt.cli.export import parse_tare
+from seaopt.cli.export import list_broken_requirements, parse_tare
 from seaopt.cli.inspect import parse_pairs
 from seaopt.cli.progress import show_progress
 from seaopt.cli.provenance import FILES
@@ -33,6 +33,7 @@ from seaopt.problem import Problem, certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.problem.stages import design_mpc, list_plants
 from seaopt.reporting.sections import judge
+from seaopt.reporting.sections.data import Commands
 from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.signals import REFERENCE
@@ -88,7 +89,7 @@ def accept_logs(
         read = [read_loop_log(session.problem, log, units, reference) for log in logs]
         for text in (f"note: {log.source}: {note}" for log in read for note in log.notes):
             errors.wrap(text)
-        tell("replaying the law, and comparing the machine with those that were certified", 0.1)
+        tell("replaying the law, and comparing the machine with its model", 0.1)
         result = accept(
             source,
             read,
@@ -98,11 +99,15 @@ def accept_logs(
             ranges=take_ranges(controller, session.problem.ranges),
             played=_find_played(folder, stage, path),
         )
+    certificate, broken = _find_certificate(folder, stage, path)
+    result = replace(result, certificate=certificate, broken=broken)
     content = write(result, session, logs)
     again = write_again(result, session)
     if again:
         errors.wrap(f"note: to fit these logs too, put the tables of {again[-1]} into the problem file")
-    return _show(result, session, content, [folder / FILE, folder / PAGE, *again], json=json, amount=amount)
+    files = [folder / FILE, folder / PAGE, *again]
+    certify = session.spell("certify" if stage is None else "bringup")
+    return _show(result, session, content, files, json=json, amount=amount, again=certify)
 
 
 def _describe(result: Acceptance | BringUp, session: Session) -> dict[str, Any]:
@@ -119,13 +124,14 @@ def _show(
     *,
     json: bool,
     amount: Amount,
+    again: str = "",
 ) -> bool:
-    """Print a result; return whether it is met. `files`: that were written of it."""
+    """Print a result; return whether it is met. `files`: that were written of it; `again`: what certifies its law."""
     if json:
         sys.stdout.write(to_json(content))
         return content["met"]
     console = Terminal()
-    verdict = judge(result)
+    verdict = judge(result, Commands(certify=again))
     if verdict is not None and not session.fit_met():
         verdict = doubt_design(verdict)
     show_verdicts(console, [] if verdict is None else [verdict], verbose=amount == "verbose")
@@ -136,20 +142,46 @@ def _show(
 
 
 def _find_played(folder: Path, stage: str | None, path: Path) -> Played | None:
-    """Return how long the reference of a stage is, by the bring-up of a folder; None where it has no such stage, or one
-    of another law than that of `path`, from before it was tuned again.
-    """
-    name = stage or FULL
-    try:
-        stages = read_json(folder / BRING_UP / PLAN, BRINGUP_SCHEMA)["stages"]
-        planned, judged = (read_json(each, SCHEMAS["tune"]) for each in (folder / BRING_UP / name / path.name, path))
-    except SeaoptError:  # none was planned, or it was edited
-        return None
-    found = next((each["reference"] for each in stages if each["name"] == name), None)
-    if found is None or planned.get("law") != judged.get("law"):
+    """Return how long the reference of a stage is, by the bring-up of a folder; None where it has no such stage."""
+    planned = (each["reference"] for each in _list_planned(folder, path) if each["name"] == (stage or FULL))
+    found = next(planned, None)
+    if found is None:
         return None
     periods = found["periods"] * found["phases"] + 2  # one that fades in, and one that fades out
     return Played(period_s=found["period_s"], lasts_s=periods * found["period_s"])
+
+
+def _list_planned(folder: Path, path: Path) -> list[dict[str, Any]]:
+    """Return the stages of a folder's bring-up that are of the law of `path`, which may have been tuned again since."""
+    try:
+        stages = read_json(folder / BRING_UP / PLAN, BRINGUP_SCHEMA)["stages"]
+        laws = [read_json(folder / BRING_UP / each["name"] / path.name, SCHEMAS["tune"]) for each in stages]
+        own = read_json(path, SCHEMAS["tune"])
+    except SeaoptError:  # none was planned, or it was edited
+        return []
+    same = ("law", "schedule", "mpc")
+    pairs = zip(stages, laws, strict=True)
+    return [stage for stage, law in pairs if all(law.get(key) == own.get(key) for key in same)]
+
+
+def _find_certificate(
+    folder: Path, stage: str | None, path: Path
+) -> tuple[Literal["met", "failed", "missing"], tuple[str, ...]]:
+    """Return what the certificate of a law says, and which requirements are not met; of a stage, and of a full law that
+    was not certified by itself, what its bring-up found.
+    """
+    if stage is None:
+        try:
+            broken = list_broken_requirements(path, folder / FILES["certify"])
+        except SeaoptError:  # it is of another law, or was edited
+            broken = None
+        if broken is not None:
+            return "failed" if broken else "met", tuple(broken)
+    planned = _list_planned(folder, path)
+    met = [
+        each["met"] for each in planned if each["name"] == stage or (stage is None and each["name"].startswith(FULL))
+    ]
+    return ("met" if all(met) else "failed") if met else "missing", ()
 
 
 def _read_stage(session: Session, path: Path) -> Source:

@@ -229,7 +229,7 @@ class Session:
                 if (law.over, list(law.points)) != (schedule.over, schedule.points):
                     raise ProblemError(
                         f"{self._path('tune')}: is over other points than [controller.schedule] of "
-                        f"{self.problem.source}; run {self._spell('tune')} again"
+                        f"{self.problem.source}; run {self.spell('tune')} again"
                     )
                 self._check_spec(replace(law.spec, bandwidth_hz=self._spec().bandwidth_hz))
             self.results["tune"] = law
@@ -247,7 +247,7 @@ class Session:
         of the problem's own.
         """
         if self.problem.mpc is not None:
-            check_mpc_file(self.problem, self.plan(), path, f"run {self._spell('tune')}, and certify that")
+            check_mpc_file(self.problem, self.plan(), path, f"run {self.spell('tune')}, and certify that")
             self._keep(linear_controller(self.plan()))
             return
         given = read_law(path)
@@ -277,7 +277,7 @@ class Session:
             if name not in stated and value != spec.get(name):
                 raise ProblemError(
                     f"{self._path('tune')}: spec.{name} is {value}, and [controller] of {self.problem.source} asks for "
-                    f"{spec.get(name)}; correct one of them, or run {self._spell('tune')} again"
+                    f"{spec.get(name)}; correct one of them, or run {self.spell('tune')} again"
                 )
 
     def fit_met(self) -> bool:
@@ -299,7 +299,7 @@ class Session:
         """Read an earlier stage's result; one that was edited, or made from something else than is there, is refused. A
         controller made for another [robustness] is taken, as a certificate may ask about it.
         """
-        path, again = self._path(stage), f"run {self._spell(stage)}"
+        path, again = self._path(stage), f"run {self.spell(stage)}"
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
         content = read_json(path, SCHEMAS[stage], remedy=f"{again} again{OWN_LAW if stage == 'tune' else ''}")
@@ -535,7 +535,7 @@ class Session:
         if stage == "frf":
             return [Verdict(met=good, text=text) for good, text in result.verdict()]
         if stage == "sweep":
-            mend = Step(text="mend the fit:", copied=(self._spell("fit"),))
+            mend = Step(text="mend the fit:", copied=(self.spell("fit"),))
             return [] if self.fit_met() else [Verdict(met=False, text=UNMET, next=(mend,))]
         verdicts: list[Verdict] = []
         if stage == "tune":
@@ -543,15 +543,15 @@ class Session:
             if joint is not None:
                 verdicts.append(Verdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
             result = result if self.problem.mpc is None else self.plan()
-        again = self._spell("run" if self.problem.table.experiment else "tune")
+        again = self.spell("run" if self.problem.table.experiment else "tune")
         recipes = {
             table.plant: self.problem.plants[table.plant].recipe
             for table in self.problem.table.experiment
             if table.use == "fit"
         }
         commands = Commands(
-            fit=self._spell("fit"),
-            tune=self._spell("tune"),
+            fit=self.spell("fit"),
+            tune=self.spell("tune"),
             certify=again,
             plants={name: () if recipe is None else tuple(recipe.parts) for name, recipe in recipes.items()},
         )
@@ -566,7 +566,7 @@ class Session:
         guesses = state_guesses(self.problem.table.guessed)
         return [name_guesses(verdict, guesses) for verdict in verdicts]
 
-    def _spell(self, command: str) -> str:
+    def spell(self, command: str) -> str:
         """Return a command on this problem as it is typed."""
         return f"seaopt {command} {shlex.quote(self.problem.source)} -o {shlex.quote(str(self.folder))}"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -74,6 +74,10 @@ class Acceptance(Result, Worded):
     stepped : Difference or None
         The rate at which the law is stepped, where no log has a response and what the machine made of the commands
         tells that it is another than that of the log's clock.
+    certificate : {"met", "failed", "missing"} or None
+        Of the law; None where nothing is known of one, as in `accept`. Without one that is met the law is not accepted.
+    broken : tuple of str
+        The requirements that a certificate says are not met.
     """
 
     controller: Controller
@@ -86,6 +90,8 @@ class Acceptance(Result, Worded):
     gaps: tuple[Gaps | None, ...] = ()
     stepped: Difference | None = None
     experiments: tuple[Log, ...] = ()
+    certificate: Literal["met", "failed", "missing"] | None = None
+    broken: tuple[str, ...] = ()
 
     @property
     def replayed(self) -> bool:
@@ -95,10 +101,11 @@ class Acceptance(Result, Worded):
     @property
     def met(self) -> bool:
         """Whether every log was made by this law, each limit of the loop is confirmed, and the machine is one of those
-        that were certified.
+        that were certified, or, where nothing is known of a certificate, within the uncertainty that was given.
         """
         judged = self.response is not None and self.response.met
-        return self.replayed and judged and (self.differences is None or self.differences.inside)
+        certified = self.certificate in ("met", None)
+        return self.replayed and judged and certified and (self.differences is None or self.differences.inside)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of acceptance.json (schema seaopt/acceptance/1)."""
@@ -107,6 +114,8 @@ class Acceptance(Result, Worded):
         content = {
             "schema": ACCEPTANCE_SCHEMA,
             "met": self.met,
+            "certificate": self.certificate,
+            "certificate_failed": self.broken,
             "replay": {"met": self.replayed, "logs": logs},
             "response": None if self.response is None else self.response.to_dict(),
             "differences": self.differences,
@@ -145,7 +154,8 @@ def accept(
     others : mapping of name to Controller, optional
         Laws that may have run in its place, such as those of earlier tunings.
     uncertainty : Fit or ParameterSet, optional
-        What the controller was certified for, with `ranges`: draws of it say how far a machine may be from the model.
+        What a machine may be, with `ranges`, such as the controller was certified for: draws of it say how far one may
+        be from the model.
     ranges : mapping of str to (low, high), optional
         As in `certify`, of what the design plant has.
     confidence : float

@@ -28,6 +28,7 @@ from seaopt.reporting.sections.data import (
     Mark,
     Reason,
     Section,
+    Step,
     Style,
     Table,
     Verdict,
@@ -40,7 +41,7 @@ PARTS = {
     "replay": "Is it this law",
     "causes": "Why the command differs",
     "response": "Does the loop keep its limits",
-    "differences": "What differs from what was certified",
+    "differences": "What differs from the model",
     "provenance": "Provenance",
 }
 MOST_CAUSES = 5
@@ -56,9 +57,7 @@ NO_GAINS = (
     "The law has no gains with names (it is one's own, or predictive control): a part that is left out, or a gain "
     "that is another, is not looked for in such a log; log every tick, where all of it counts."
 )
-ONE_BY_ONE = (
-    "Each line by itself is within reach of some certified machine, but none of them explains all lines together."
-)
+ONE_BY_ONE = "Each line by itself is within reach of some such machine, but none of them explains all lines together."
 RATE = (
     "These figures are in the machine's seconds: the law is stepped at {} times the rate that the log's clock says, "
     "and all that is read off that clock is wrong."
@@ -74,12 +73,12 @@ STUCK = (
 )
 SLIDES = "Predicted is the actuator as it slides, but for a figure stuck; its bandwidth is {}."
 PLAYED = (
-    "Predicted is the certified machine under the reference of the log, simulated: with dry friction it is another one "
-    "at another amplitude; its bandwidth is {}."
+    "Predicted is the model under the reference of the log, simulated: with dry friction it is another one at another "
+    "amplitude; its bandwidth is {}."
 )
 AS_PLAYED = (
-    "The bandwidth that is judged is the least that certified machines have under this reference, {}: it is not the {} "
-    "that was asked of the machine as it slides. Here it is {}{}."
+    "The bandwidth that is judged is the least that {} have under this reference, {}: it is not the {} that was asked "
+    "of the machine as it slides. Here it is {}{}."
 )
 REACHES = ", which is what was asked"
 FASTER = ", {} times what was asked: nothing bounds it above, so look at Ms and Mt"
@@ -107,6 +106,10 @@ HIDDEN = (
     "of the rounding of the whole log by {} std."
 )
 AND = "with the first one also: "
+UNCERTIFIED = {
+    "missing": "not certified: there is no certificate of this law",
+    "failed": "not certified: the certificate of this law FAILED",
+}
 
 
 def judge(result: Acceptance, commands: Commands) -> Verdict | None:
@@ -126,13 +129,27 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
         if counts["undecided"]:
             reasons.append(Reason(what=f"the log does not decide {_say_undecided(response)}"))
     if differences is not None and not differences.inside:
-        parts.append("the machine is not one of those certified")
+        parts.append(_say_inside(result, differences))
         reasons.append(Reason(what=_say_best(differences)))
     if result.stepped is not None:
         reasons.append(Reason(what=say_difference(result.stepped)))
+    if result.certificate in UNCERTIFIED:
+        parts.append("the law is not certified")
+        reasons.append(Reason(what=UNCERTIFIED[result.certificate], where=", ".join(result.broken)))
     if response is None and result.replayed:
         reasons += [Reason(what=f"no response: {text}") for text in result.left_out.values()]
-    return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons))
+    missing = result.certificate == "missing" and commands.certify
+    steps = (Step(text="certify the law:", copied=(commands.certify,)),) if missing else ()
+    return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons), next=steps)
+
+
+def _say_inside(result: Acceptance, differences: Differences) -> str:
+    """Return whether the machine is one of those that were certified, or else of what it was compared with."""
+    no = "" if differences.inside else "not "
+    if result.certificate == "met":
+        return f"the machine is {no}one of those that were certified"
+    given = "within the uncertainty that was given" if differences.nearest else "the design plant"
+    return f"the machine is {no}{given}"
 
 
 def _say_best(differences: Differences) -> str:
@@ -160,11 +177,12 @@ def _say_stuck(row: Judged, controller: Controller) -> str:
     return said + (WORTH.format(sizes[2], f"{100.0 * (row.limit or 0.0) / asked:.0f} %") if little else "")
 
 
-def _say_as_played(row: Judged, controller: Controller) -> str:
+def _say_as_played(row: Judged, result: Acceptance) -> str:
     """Return of which bandwidth the row is, and which one was asked."""
-    asked, value = controller.spec.bandwidth_hz, row.value or 0.0
+    asked, value = result.controller.spec.bandwidth_hz, row.value or 0.0
     sizes = [f"{format_number(each, 3)} Hz" for each in ((row.limit or 0.0) / (1.0 - SHORT_BY), asked, value)]
-    return AS_PLAYED.format(*sizes, _say_reached(value, asked))
+    machines = "certified machines" if result.certificate == "met" else "machines within the uncertainty that was given"
+    return AS_PLAYED.format(machines, *sizes, _say_reached(value, asked))
 
 
 def _say_reached(value: float, asked: float) -> str:
@@ -244,7 +262,7 @@ def describe(result: Acceptance) -> list[Section]:
     if result.response is not None:
         sections.append(_describe_response(result, result.response))
     if result.differences is not None:
-        sections.append(_describe_differences(result.differences))
+        sections.append(_describe_differences(result, result.differences))
     return sections
 
 
@@ -278,7 +296,7 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
         remarks.append((PLAYED if played else SLIDES).format(both))
     remarks += explain_sliding(result.controller)
     remarks += [_say_stuck(row, result.controller) for row in response.judged if row.state == "stuck"]
-    remarks += [_say_as_played(row, result.controller) for row in response.judged if row.state == "as played"]
+    remarks += [_say_as_played(row, result) for row in response.judged if row.state == "as played"]
     if response.still:
         unit = unit_after(result.controller.command.effort_unit)
         sizes = (f"{format_number(value, 3)}{unit}" for value in (response.effort, response.friction))
@@ -320,7 +338,7 @@ def _show_range(each: Difference) -> str:
     return f"{format_number(scale * each.low, 3)} to {format_number(scale * each.high, 3)}{unit}"
 
 
-def _describe_differences(differences: Differences) -> Section:
+def _describe_differences(result: Acceptance, differences: Differences) -> Section:
     rows = tuple(
         (
             say_difference(each),
@@ -329,22 +347,17 @@ def _describe_differences(differences: Differences) -> Section:
         )
         for each in differences.found
     )
-    inside = (
-        "The machine is one of those that were certified"
-        if differences.inside
-        else "The machine is not one of those that were certified"
-    )
-    sentences = [
-        f"{inside}: the measured plant is off by {format_number(differences.misfit**0.5, 3)} times its noise (rms)."
-    ]
+    inside, off = _say_inside(result, differences), format_number(differences.misfit**0.5, 3)
+    sentences = [f"{inside[0].upper()}{inside[1:]}: the measured plant is off by {off} times its noise (rms)."]
     if differences.each_line and not differences.inside and not any(each.kind == "range" for each in differences.found):
         sentences.append(ONE_BY_ONE)
     if differences.nearest:
         nearest = ", ".join(f"{name} {format_number(value)}" for name, value in differences.nearest.items())
-        sentences.append(f"The nearest of the certificate's draws: {nearest}.")
+        whose = "certificate's draws" if result.certificate == "met" else "draws of the uncertainty that was given"
+        sentences.append(f"The nearest of the {whose}: {nearest}.")
     tables = (Table(head=("difference", "95 % interval", "explains"), rows=rows, align="<>>"),) if rows else ()
     return Section(
-        title="Measured and certified", part="differences", sentences=tuple(sentences), tables=tables,
+        title="Measured and model", part="differences", sentences=tuple(sentences), tables=tables,
         remarks=_remark(differences),
     )  # fmt: skip
 

@@ -121,7 +121,7 @@ def _say_part(each: Difference) -> str:
             )
         case "delay":
             way = "later" if each.value > 0.0 else "earlier"
-            return f"the loop is {abs(1e3 * each.value):.3g} ms {way} than certified"
+            return f"the loop is {abs(1e3 * each.value):.3g} ms {way} than in the model"
         case "mode":
             pole = "" if each.size is None else f", its pole at {format_number(each.value / each.size, 3)} Hz"
             size = (
@@ -138,6 +138,6 @@ def _say_part(each: Difference) -> str:
             )
         case "gain":
             turned = "the sign of the drive is turned; " if each.value < 0.0 else ""
-            return f"{turned}the force per command is {format_number(each.value, 3)} times the certified one{also}"
+            return f"{turned}the force per command is {format_number(each.value, 3)} times the model's{also}"
         case _:
             return f"{each.name} is {format_number(each.value, 3)} times its value{also}"

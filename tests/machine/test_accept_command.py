@@ -20,7 +20,7 @@ schema = 1
 title = "Stand"
 parameters = { I_p = { value = 0.36, unit = "kg m^2" } }  # of the other plant alone
 plant = { stand = { kind = "high_impedance" }, swing = { kind = "moving_output" } }
-robustness = { plants = ["swing"], parameters = { I_p = [0.2, 0.6] } }
+robustness = { plants = ["swing"], parameters = { I_p = [0.2, 0.6] }, samples = 5 }
 controller = { plant = "stand", measured = "F1", bandwidth_hz = 30, max_sensitivity = 1.6, current_limit_A = 9.0 }
 """
 
@@ -32,7 +32,8 @@ def folder(compiler, tmp_path_factory):
 
     home = tmp_path_factory.mktemp("accept")
     (home / "stand.toml").write_text(PROBLEM)
-    assert CliRunner().invoke(app, ["tune", str(home / "stand.toml"), "-o", str(home / "out")]).exit_code == 0
+    for command in ("tune", "certify"):
+        assert CliRunner().invoke(app, [command, str(home / "stand.toml"), "-o", str(home / "out")]).exit_code == 0
     content = json.loads((home / "out" / "controller.json").read_text())
     problem = so.read_problem(home / "stand.toml")
     controller = so.Controller.from_dict(content, problem.design_plant, problem.values(problem.parameters))
@@ -195,6 +196,35 @@ def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
     assert content["replay"]["logs"][1]["causes"][0]["kind"] == "factor"
 
 
+@pytest.mark.parametrize("certificate", ["missing", "failed", "of another law"])
+def test_a_law_without_a_certificate_that_is_met_is_not_accepted(folder, accept, tmp_path, certificate):
+    """As of `seaopt export`; what was measured is shown all the same, and nothing is called certified."""
+    file = folder / "out" / "robustness.json"
+    content = json.loads(file.read_text())
+    file.rename(tmp_path / "kept.json")
+    if certificate == "failed":
+        content["requirements"][0]["met"] = False
+    if certificate == "of another law":
+        content["made_from"]["controller.json"] = "0123456789abcdef"
+    if certificate != "missing":
+        write_json(file, content)
+    try:
+        done = accept(folder / "good.csv")
+    finally:
+        (tmp_path / "kept.json").replace(file)
+    says, record = " ".join(done.output.split()), json.loads((folder / "out" / "acceptance.json").read_text())
+    failed = certificate == "failed"
+    assert done.exit_code == 1 and says.count("not met Acceptance") == 1, says
+    assert not record["met"] and record["certificate"] == ("failed" if failed else "missing")
+    assert record["certificate_failed"] == ([content["requirements"][0]["name"]] if failed else [])
+    assert "limits confirmed, 0 refuted; the law is not certified" in says and "Ms confirmed" in says
+    assert ("the certificate of this law FAILED" in says) == failed
+    assert ("next: certify the law: seaopt certify" in says) == (not failed)
+    page = (folder / "out" / "acceptance.html").read_text()
+    for text in (says, page):
+        assert "not certified:" in text and "were certified" not in text and "certificate's draws" not in text
+
+
 SCHEDULED = PROBLEM.replace("9.0 }", '9.0, schedule = { over = "k", points = [5e5, 8e5] } }').replace("= 30", "= 25")
 
 
@@ -205,7 +235,8 @@ def test_a_schedule_is_accepted_at_the_value_that_is_typed(compiler, tmp_path):
 
     (tmp_path / "stand.toml").write_text(SCHEDULED)
     arguments = [str(tmp_path / "stand.toml"), "-o", str(tmp_path / "out")]
-    CliRunner().invoke(app, ["tune", *arguments])
+    for command in ("tune", "certify"):
+        assert CliRunner().invoke(app, [command, *arguments]).exit_code == 0
     content = json.loads((tmp_path / "out" / "controller.json").read_text())
     problem = so.read_problem(tmp_path / "stand.toml")
     schedule = ScheduledController.from_dict(content, problem.design_plant, problem.values(problem.parameters))
