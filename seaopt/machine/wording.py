@@ -5,6 +5,7 @@ from __future__ import annotations
 from seaopt.formatting import format_number
 from seaopt.machine.causes import Cause
 from seaopt.machine.differences.size_fit import Difference
+from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.free_gains import SAME_GAINS
 from seaopt.units import unit_after
 
@@ -112,7 +113,9 @@ def say_difference(each: Difference) -> str:
 
 
 def _say_part(each: Difference) -> str:
-    others = [f"{name} {format_number(value, 3)}" for name, value in zip(each.alike, each.alike_values, strict=True)]
+    others = [
+        f"{name} {''.join(_say_factor(name, value))}" for name, value in zip(each.alike, each.alike_values, strict=True)
+    ]
     also = f" (or {', or '.join(others)})" if others else ""
     match each.kind:
         case "range":
@@ -140,4 +143,11 @@ def _say_part(each: Difference) -> str:
             turned = "the sign of the drive is turned; " if each.value < 0.0 else ""
             return f"{turned}the force per command is {format_number(each.value, 3)} times the model's{also}"
         case _:
-            return f"{each.name} is {format_number(each.value, 3)} times its value{also}"
+            number, bound = _say_factor(each.name, each.value)
+            return f"{each.name} is {number} times its value{bound}{also}"
+
+
+def _say_factor(name: str, value: float) -> tuple[str, str]:
+    """Return a factor, and where it is at an end of what is tried, in which direction it may be further."""
+    end = 0 if name == "gain" else find_end(value)
+    return format_number(value, 2 if end else 3), ("", " or more", " or less")[end]

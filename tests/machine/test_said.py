@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.machine.differences.size_fit import Difference
+from seaopt.machine.wording import say_difference
 from tests.machine.simulator import Machine
 from tests.machine.test_left_out import read_everywhere
 from tests.machine.test_response import REFERENCE
@@ -49,3 +52,10 @@ def test_a_stuck_bandwidth_is_said_beside_what_was_asked(judged, value, says, li
     text = " ".join(repr(replace(result, response=replace(result.response, judged=tuple(rows)))).split())
     assert says in text
     assert ("The limit of 5.4 Hz is 18 % of what was asked" in text) == little
+
+
+def test_a_factor_at_the_end_of_what_is_tried_is_said_to_be_that_or_more():
+    made = {"kind": "parameter", "name": "b_r", "unit": "-", "explains": 1.0, "low": None, "high": None}
+    largest = Difference(value=math.exp(3.0), alike=("k", "gain"), alike_values=(math.exp(-3.0), 0.03), **made)
+    assert say_difference(largest) == "b_r is 20 times its value or more (or k 0.05 or less, or gain 0.03)"
+    assert say_difference(Difference(value=19.9, **made)) == "b_r is 19.9 times its value"

@@ -6,7 +6,6 @@ reference and cut as the log is, since it depends on amplitude; two periods of e
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ from jaxtyping import Complex, Float
 from seaopt.control import Controller, sample
 from seaopt.errors import LogError
 from seaopt.machine.design_run import RTOL, run_design
+from seaopt.machine.differences.few_periods import find_widening
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.judged import Measured
 from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
@@ -69,11 +69,8 @@ class Comparison:
 
     @property
     def widening(self) -> float:
-        """By how much sizes that are fitted with weights of :math:`1/s^2` spread more than these tell: of normal errors
-        the mean of :math:`s^{-4}` over the square of that of :math:`s^{-2}`, with nu = 2P - 2 degrees of freedom.
-        """
-        free = 2 * min(ratio.blocks for ratio in self.ratios) - 2
-        return math.sqrt(max(free - 2, 1) / max(free - 4, 1))
+        """By how much sizes that are fitted with weights of :math:`1/s^2` spread more than these tell."""
+        return find_widening(min(ratio.blocks for ratio in self.ratios), self.response.size)
 
     @property
     def f(self) -> Float[np.ndarray, " m"]:

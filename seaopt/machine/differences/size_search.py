@@ -78,6 +78,12 @@ class Knob:
         return (1.0 if self.kind == "parameter" else self.parameter.value) * math.exp(min(size, MOST_SPREAD))
 
 
+def find_end(factor: float) -> int:
+    """Return whether a factor of a parameter is at the upper (1) or the lower end (-1) of what is tried, or neither."""
+    end = math.exp(MOST_LOG - FOUND)
+    return int(factor >= end) - int(factor <= 1.0 / end)
+
+
 def make_delay(sample_time_s: float) -> Knob:
     """Return the delay beyond that which was certified."""
     return Knob(kind="delay", parameter=Parameter(name=DELAY, value=0.0, unit="s"), sample_time_s=sample_time_s)
