@@ -170,7 +170,7 @@ class Table:
             controller=controller,
             blocks=blocks,
             ticks_per_row=ticks_per_row,
-            made=make_commands(responses, blocks),
+            made=blocks.make_efforts(responses),
             leakage=find_leakage(controller.law, blocks, ticks_per_row),
             rounding=each,
         )
@@ -264,7 +264,7 @@ class Table:
 
     def differ(self, law: Law) -> Parts:
         """Return what another law makes more than this one."""
-        return make_commands(evaluate(law, self.blocks, self.ticks_per_row), self.blocks) - self.made
+        return self.blocks.make_efforts(evaluate(law, self.blocks, self.ticks_per_row)) - self.made
 
     def is_alias(self, found: Off) -> bool:
         """Tell whether the law holds at what comes back as the lines, above half of the log's rate."""
@@ -272,7 +272,7 @@ class Table:
         responses = [
             evaluate(self.controller.law, self.blocks, self.ticks_per_row, k) for k in range(-reach, reach + 1)
         ]
-        off = np.array([self.blocks.effort - make_commands(each, self.blocks) for each in responses])
+        off = np.array([self.blocks.effort - self.blocks.make_efforts(each) for each in responses])
         nearest = np.argmin(np.mean(np.abs(off), axis=1), axis=0)
         chosen = np.take_along_axis(off, nearest[None, None, :], axis=0)[0]
         return float(np.sum(found.scale(self.average(chosen)) ** 2)) <= found.most
@@ -332,11 +332,6 @@ def evaluate(law: Law, blocks: Blocks, ticks_per_row: int, image: int = 0) -> Co
     """Return a law's responses at the lines, or at what comes back as them, by the log's own clock."""
     turns = (np.round(blocks.f * blocks.period_s) / blocks.rows + image) / ticks_per_row
     return law.evaluate(np.expm1(2j * np.pi * turns))
-
-
-def make_commands(responses: Complex[np.ndarray, "k m"], blocks: Blocks) -> Parts:
-    """Return what a law of these responses makes of reference and readings."""
-    return responses[0] * blocks.reference + np.sum(responses[1:] * blocks.measured, axis=1)
 
 
 def find_leakage(law: Law, blocks: Blocks, ticks_per_row: int) -> Float[np.ndarray, "k n"]:

@@ -12,7 +12,7 @@
 #include "force_law.h"
 #define LAW force_law_law
 #define START(law) force_law_init(law)
-#ifdef PLACED /* scheduled */
+#if defined(PLACED) || defined(READS) /* scheduled, or with a term that reads the motor's position */
 #define STEP(law, r, y, place) force_law_step(law, r, y, place)
 #else
 #define STEP(law, r, y, place) force_law_step(law, r, y)
@@ -49,9 +49,9 @@ static void advance(const machine *m, double *x, double i, double h)
 }
 
 /* Run n ticks of `period` seconds; `force` is what the sensor showed, `current` what the firmware sent, `place` where a
- * schedule's variable was said to be. */
+ * schedule's variable was said to be, or where the motor was read. */
 void run(const machine *m, long n, long steps, double period, const double *reference, const double *noise,
-         const double *place, double *force, double *current)
+         double *place, double *force, double *current)
 {
     static LAW law;
     double x[4] = {0, 0, 0, 0}, u = 0.0;
@@ -62,6 +62,9 @@ void run(const machine *m, long n, long steps, double period, const double *refe
         if (m->force_step > 0) reading = m->force_step * floor(reading / m->force_step + 0.5);
         if (reading > m->sensor_range) reading = m->sensor_range;
         if (reading < -m->sensor_range) reading = -m->sensor_range;
+#ifdef READS
+        place[k] = x[0];
+#endif
         if (k % every == 0) {
             u = m->law_gain * STEP(&law, reference[k], m->reading_sign * reading, place[k]);
             if (m->current_step > 0) u = m->current_step * floor(u / m->current_step + 0.5);

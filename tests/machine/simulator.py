@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import seaopt as so
-from seaopt.control import ForceMPC, ScheduledController, export_mpc
+from seaopt.control import Controller, ForceMPC, ScheduledController, export_mpc
 
 SOURCE = Path(__file__).with_name("machine.c")
 STEPS = 20  # integration steps per tick
@@ -69,6 +69,8 @@ class Bench:
         kind = ["-DPLAN"] if isinstance(controller, ForceMPC) else []
         if isinstance(controller, ScheduledController):
             kind = ["-DPLACED"]
+        elif isinstance(controller, Controller) and controller.further:
+            kind = ["-DREADS"]
         if not exported and isinstance(controller, ForceMPC):
             export_mpc(controller, self.folder)
         elif not exported:
@@ -111,6 +113,8 @@ class Bench:
                 columns | {self.controller.over: places},
                 units | {self.controller.over: self.controller.unit},
             )
+        elif isinstance(law, Controller) and law.further:
+            columns, units = columns | {law.further[0]: place}, units | {law.further[0]: "m"}
         return so.Log.from_arrays(**columns, units=units, source="bench")
 
 

@@ -117,13 +117,8 @@ class Comparison:
                 blocks.append(cut_periods(self.controller, simulated))
             except LogError:  # of each set of phases, the periods that were not at the limit are others
                 blocks.append(cut_periods(self.controller, replace(simulated, command=0.0 * ticks.command)))
-        return [self._command(group) for group in join_blocks(blocks)]
-
-    def _command(self, blocks: Blocks) -> Blocks:
-        """Return periods with the effort that the law makes of what it reads in them."""
-        forward, *feedback = self.controller.law.responses(blocks.f)
-        effort = forward * blocks.reference + np.sum(np.array(feedback) * blocks.measured, axis=1)
-        return replace(blocks, effort=effort)
+        responses = self.controller.law.responses
+        return [replace(group, effort=group.make_efforts(responses(group.f))) for group in join_blocks(blocks)]
 
     def read(self, groups: Sequence[Blocks]) -> Lines:
         """Return the responses of periods to the effort, signal by signal, amplitude by amplitude."""

@@ -81,6 +81,10 @@ class Blocks:
         """How many stretches there are."""
         return len(np.unique(self.realisation))
 
+    def make_efforts(self, responses: Complex[np.ndarray, "k m"]) -> Complex[np.ndarray, "b m"]:
+        """Return what a linear law of these responses makes of the reference and of what it reads."""
+        return responses[0] * self.reference + np.sum(responses[1:] * self.measured, axis=1)
+
     def average(self) -> Blocks:
         """Return one row per stretch, the mean of its periods."""
         kinds = np.unique(self.realisation)

@@ -11,6 +11,10 @@ With :math:`\hat L` of std s and the limit :math:`M_s`, at a risk :math:`\alpha`
 - *refuted*, where a line has :math:`|1 + \hat L| + R(\alpha/m) < 1/M_s`: one of m statements.
 - *undecided* otherwise; the std falls with the root of the periods, which tells how many would decide.
 
+With dry friction, what a law adds to its linear part (friction, weight, ripple) counts to the machine, as in what is
+predicted: there U is what the linear part makes of reference and readings, :math:`C_r R - V`, with which 1/(1 + L) is
+the sensitivity of what runs.
+
 The other figures are judged by the discs in the same way: all lines at :math:`\alpha`, or one of them at
 :math:`\alpha/m`. Nothing is said between the lines, nor beyond them; that lines keep a limit therefore confirms it
 only where they lie closely about the crossover. With dry friction the response is that of the amplitude and the phases
@@ -125,8 +129,9 @@ def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
 def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured:
     """Return the response of periods of one amplitude; `by_phases`: of means over the periods of each set of phases."""
     rows = blocks.average() if by_phases else blocks
-    feedback = -controller.law.responses(blocks.f)[1:]
-    effort = rows.effort / rows.reference
+    responses = controller.law.responses(blocks.f)
+    feedback = -responses[1:]
+    effort = (rows.make_efforts(responses) if has_terms(controller) else rows.effort) / rows.reference
     measured = rows.measured / rows.reference[:, None, :]
     returned = np.sum(feedback * measured, axis=1)
     outputs = dict(zip(controller.signals, measured.swapaxes(0, 1), strict=True))
@@ -142,6 +147,13 @@ def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured
         amplitude=blocks.amplitude,
         left_out=blocks.left_out,
     )
+
+
+def has_terms(controller: Controller) -> bool:
+    """Tell whether what a law adds to its linear part belongs to the machine: with dry friction, where both are
+    simulated. The response of a linear machine is that to all of the command.
+    """
+    return controller.compensation is not None and has_dry_friction(controller)
 
 
 def has_dry_friction(controller: Controller) -> bool:
