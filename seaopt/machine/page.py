@@ -15,9 +15,9 @@ from seaopt.machine.figures import list_panels
 from seaopt.machine.free_gains import read_gains
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
-from seaopt.machine.response.verdicts import CLOSEST, FEWEST_LINES, LEAST_PHASES, SHORT_BY, Judged, Measured, Response
+from seaopt.machine.response.verdicts import LEAST_PHASES, SHORT_BY, Judged, Measured, Response
 from seaopt.machine.ticks import AT_LIMIT, Gaps
-from seaopt.machine.wording import say_cause, say_difference
+from seaopt.machine.wording import say_cause, say_difference, say_missing
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -212,10 +212,7 @@ def _say_undecided(response: Response) -> str:
         )
         record.append(f"{LEAST_PHASES} sets of random phases{below}, which dry friction asks for")
     if response.needs_lines is not None:
-        low, high = (format_number(edge, 3) for edge in response.needs_lines)
-        record.append(
-            f"at least {FEWEST_LINES} lines from {low} to {high} Hz, each at most {CLOSEST:g} times the one before"
-        )
+        record.append(say_missing(response.needs_lines, response.missing))
     if periods := max((row.periods or 0 for row in rows), default=0):
         record.append(f"{periods} periods in all ({format_number(periods * response.period_s, 3)} s)")
     wanted = join_words(record) or "more periods, or a larger reference"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from seaopt.formatting import format_number
+from collections.abc import Sequence
+
+from seaopt.formatting import format_number, join_words
 from seaopt.machine.causes import Cause
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.free_gains import SAME_GAINS
+from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band
 from seaopt.units import unit_after
 
 EVERY_TICK = "of a log with every n-th tick"
@@ -105,6 +108,23 @@ def _say_gains(cause: Cause) -> str:
     values = [f"{name} {format_number(found[name])} ({format_number(exported[name])} exported)" for name in named]
     whose = "" if cause.what == "law" else f", those of {cause.what}"
     return f"it is a law with another set of gains{whose}: {', '.join(values)}"
+
+
+def say_missing(reach: Band, missing: Sequence[Band]) -> str:
+    """Return which lines to record. `reach`: from where to where they are to lie."""
+    if tuple(missing) == (reach,):
+        low, high = (format_number(edge, 3) for edge in reach)
+        return f"at least {FEWEST_LINES} lines from {low} to {high} Hz, each at most {CLOSEST:g} times the one before"
+    parts, several = list[str](), False
+    for band in missing:
+        low, high = (format_number(edge, 3) for edge in band)
+        if band[1] > CLOSEST * band[0]:
+            several = True
+            parts.append(f"lines from {low} to {high} Hz")
+        else:
+            parts.append(f"a line at {low} Hz or below" if band[0] == reach[0] else f"a line at {high} Hz or above")
+    close = f", each at most {CLOSEST:g} times the one before" if several else ""
+    return f"beside the lines that were played {join_words(parts)}{close}"
 
 
 def say_difference(each: Difference) -> str:

@@ -195,8 +195,16 @@ def test_a_figure_that_the_machine_breaks_is_refuted_and_one_in_the_noise_is_und
     assert ms.outcome == "undecided" and ms.periods > 3 and ms.low < ms.limit < ms.high
 
 
-@pytest.mark.parametrize("lines", [[1, 28], range(20, 130, 3), [1, 2, 4, 8, 16, 32, 64, 128]])
-def test_lines_that_miss_the_crossover_confirm_nothing_and_the_row_says_which_to_play(controller, bench, lines):
+@pytest.mark.parametrize(
+    ("lines", "says"),
+    [
+        ([1, 28], "record at least 8 lines from"),
+        (range(20, 130, 3), "lines from {low:.3g} to 20 Hz, each at most 1.5 times"),
+        ([1, 2, 4, 8, 16, 32, 64, 128], "lines from 8 to 64 Hz, each at most 1.5 times"),
+        (LINES[LINES < 57], "beside the lines that were played a line at {high:.3g} Hz or above"),
+    ],
+)
+def test_lines_that_miss_the_crossover_confirm_nothing_and_the_row_says_which_to_play(controller, bench, lines, says):
     machine = replace(Machine(), delay_s=2e-3)
     result = so.accept(controller, [bench.log(machine, multisine(1000, np.array(lines), 10, 60.0, 3, bias=300.0))])
     low, high = result.response.needs_lines
@@ -204,7 +212,7 @@ def test_lines_that_miss_the_crossover_confirm_nothing_and_the_row_says_which_to
     assert np.isclose(low, crossover / 4.0) and np.isclose(high, 2.0 * crossover)
     outcomes = {row.name: row.outcome for row in result.response.judged}
     assert "confirmed" not in outcomes.values() and outcomes["stability"] == "undecided" and not result.met
-    assert "record at least 8 lines" in " ".join(repr(result).split())
+    assert says.format(low=low, high=high) in " ".join(repr(result).split())
 
 
 def test_phases_are_told_apart_and_the_first_period_of_each_is_left_out(controller, bench):

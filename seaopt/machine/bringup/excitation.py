@@ -19,7 +19,7 @@ from jaxtyping import Complex, Float, Int
 from seaopt.control import Controller
 from seaopt.control.loops.sampled_plant import sample
 from seaopt.errors import ControlError, suggestion
-from seaopt.machine.response.verdicts import NYQUIST, find_reach
+from seaopt.machine.response.reach import NYQUIST, find_reach
 from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 

@@ -39,6 +39,7 @@ from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.judged import Judged, Measured, Outcome, Prediction
 from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import Blocks
+from seaopt.machine.response.reach import Band, find_missing, find_reach
 from seaopt.plants.friction import find_dry_friction, split_friction
 from seaopt.records import record
 
@@ -47,13 +48,8 @@ SAME_GAIN = 0.1  # relative, between two amplitudes
 GRACE = 0.05  # of each limit: a machine is not its model to the last digit
 SHORT_BY = 0.1  # of the bandwidth
 CENTRE = 1.0 - 1e-9  # a risk at which discs are points
-REACH = 0.25, 2.0  # of the crossover: lines go from below the first to above the second
-CLOSEST = 1.5  # ratio of neighbouring lines, at most, from half the crossover on
-FEWEST_LINES = 8
 MOST_PERIODS = 1e6  # that are counted
 HOUR = 3600.0  # s: a record that is longer is not asked for
-NYQUIST = 0.8  # of half the sample rate, above which no line has to lie
-ON_GRID = 0.05  # relative, by which the outermost lines may miss, which lie on multiples of the period's
 
 
 class AgainstFriction:
@@ -86,6 +82,7 @@ class Response(AgainstFriction):
     at_amplitude_only: bool  # dry friction, and the gain is another one at another amplitude, or was seen at one only
     needs_phases: bool  # dry friction, and fewer than six sets of phases
     needs_lines: tuple[float, float] | None = None  # Hz, from where to where lines are to lie, where they do not
+    missing: tuple[Band, ...] = ()  # Hz, between which of them none do, or too few
     effort: float | None = None  # with dry friction: the most by which the effort swings about its middle in a period
     friction: float | None = None  # which dry friction takes: below it the motor does not move
     rate: float = 1.0  # of the law, over what the clock of the logs says: Hz and seconds are those of the machine
@@ -100,6 +97,7 @@ class Response(AgainstFriction):
             "at_amplitude_only": self.at_amplitude_only,
             "needs_phases": self.needs_phases,
             "needs_lines_hz": self.needs_lines,
+            "missing_hz": self.missing,
             "rate": self.rate,
             "period_s": self.period_s,
             "friction": self.motion,
@@ -199,7 +197,8 @@ def judge_response(
     if needs_phases:  # nothing is confirmed, for the discs do not hold the truth
         rows = [_leave_open(row) for row in rows]
     low, high = find_reach(controller)
-    needs_lines = None if _covers(measured, low, high) else (low, high)
+    missing = find_missing(np.unique(np.concatenate([part.f for part in measured])), low, high)
+    needs_lines = (low, high) if missing else None
     if needs_lines:  # a line that breaks a limit does so whatever lies beside it; turns are counted from line to line
         open_ = [row.outcome == "confirmed" or row.name == "stability" for row in rows]
         rows = [_leave_open(row) if each else row for row, each in zip(rows, open_, strict=True)]
@@ -214,6 +213,7 @@ def judge_response(
         at_amplitude_only=dry and not _is_same_gain(measured),
         needs_phases=needs_phases,
         needs_lines=needs_lines,
+        missing=missing,
         effort=max(group.swing for group in groups) if dry else None,
         friction=friction if dry else None,
         rate=rate,
@@ -244,22 +244,6 @@ def _measure_bandwidth(controller: Controller, measured: Sequence[Measured]) -> 
     """Return where the tracking falls below -3 dB, at the amplitude at which it does first."""
     bound = _bound_tracking(controller)
     return min(_find_fall(part.f, _find_middle(bound, part)) for part in measured)
-
-
-def find_reach(controller: Controller) -> tuple[float, float]:
-    """Return from where to where (Hz) lines are to lie: about the crossover, or the bandwidth where there is none."""
-    middle = controller.achieved.crossover_hz or controller.spec.bandwidth_hz
-    return REACH[0] * middle, min(REACH[1] * middle, NYQUIST * 0.5 / controller.sample_time_s)
-
-
-def _covers(measured: Sequence[Measured], low: float, high: float) -> bool:
-    """Tell whether lines reach from below to above, and lie closely from twice the lower end on."""
-    f = np.unique(np.concatenate([part.f for part in measured]))
-    low, high = low * (1.0 + ON_GRID), high * (1.0 - ON_GRID)
-    if f.size < FEWEST_LINES or f[0] > low or f[-1] < high:
-        return False
-    first, last = np.searchsorted(f, 2.0 * low, side="right") - 1, np.searchsorted(f, high)
-    return bool(np.all(f[first + 1 : last + 1] <= CLOSEST * (1.0 + 1e-9) * f[first:last]))
 
 
 def _leave_open(row: Judged) -> Judged:
