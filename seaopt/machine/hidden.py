@@ -10,9 +10,10 @@ the log, less the polynomials that integrals hold, under Hann's window w and tra
     B = \frac{\sum w^2}{12} \sum_i \sum q_i^2\, \mathrm{Re}(\overline{\Delta R_i} R_i)/S,
 
 S what rounding of the command by :math:`q_u`, and of reference and readings by :math:`q_i`, leaves of the law's
-commands by its responses R, and :math:`\chi^2` what is left of :math:`|E - a C|^2/S` per line. B takes account of the
-rounding of what the laws are given, which is in e and in c, with :math:`\Delta R` what the other law's responses are
-more. Where the command is at its limit now and then, rounding is cut off there: the std is the larger of
+commands by its responses R, and :math:`\chi^2` what is left of :math:`|E - a C|^2/S` per line. The rounding of a
+reference that repeats itself repeats, too: what it adds to the variance counts once a period, not once a row. B takes
+account of the rounding of what the laws are given, which is in e and in c, with :math:`\Delta R` what the other law's
+responses are more. Where the command is at its limit now and then, rounding is cut off there: the std is the larger of
 :math:`\sigma_a` and that of the shares without one segment each (the jackknife's).
 
 Under the law a is 0, under the other one 1. A share is told where both are far from each other: an effect far below the
@@ -34,13 +35,14 @@ from seaopt.control import RunnableLaw
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.machine.causes import Alternative, Cause, list_others, list_parts
 from seaopt.machine.free_gains import make_law, read_gains
+from seaopt.machine.response.periods import find_period
 from seaopt.machine.stepped import (
     FLOOR,
-    LEVELS,
     Match,
     Others,
     Setting,
     count_integrals,
+    is_rounded,
     leave_integrals,
     play,
 )
@@ -67,6 +69,7 @@ class Segments:
     rounded: Float[np.ndarray, " k"]  # variance of what it is given, at a line
     window: Float[np.ndarray, " n"]
     integrals: int
+    repeats: float  # periods of the reference that the log has
 
     @classmethod
     def make(cls, setting: Setting, match: Match) -> Segments:
@@ -85,6 +88,7 @@ class Segments:
             rounded=power * steps**2,
             window=window,
             integrals=count_integrals(setting.linear),
+            repeats=len(ticks) / (find_period(ticks.reference) or len(ticks)),
         )
         return replace(empty, off=empty.transform(-match.error))
 
@@ -105,7 +109,9 @@ class Segments:
         shared = np.sum(np.real(np.conj(made) * self.off), axis=1) + float(np.sum(common / self.std**2))
         share = float(np.sum(shared) / np.sum(size))
         left = float(np.mean(np.abs(self.off - share * made) ** 2))
-        std = math.sqrt(max(1.0, left) / float(np.sum(size)))
+        repeated = np.abs(made) ** 2 @ (self.rounded[0] * np.abs(self.responses[0]) ** 2 / self.std**2)
+        again = (self.repeats - 1.0) * float(np.sum(repeated)) / float(np.sum(size)) ** 2
+        std = math.sqrt(max(1.0, left) / float(np.sum(size)) + again)
         if count < FEWEST:
             return share, std
         without = (np.sum(shared) - shared) / (np.sum(size) - size)
@@ -113,10 +119,9 @@ class Segments:
 
 
 def list_steps(setting: Setting) -> Float[np.ndarray, " k"]:
-    """Return the steps that reference and readings are rounded to; none of a reference of levels."""
+    """Return the steps that reference and readings are rounded to; none of a reference of steps."""
     ticks = setting.ticks
-    levels = np.unique(ticks.reference).size < LEVELS
-    first = 0.0 if levels else find_quantisation(ticks.reference)
+    first = find_quantisation(ticks.reference) if is_rounded(ticks.reference) else 0.0
     return np.array([first, *map(find_quantisation, ticks.measured.T)])
 
 

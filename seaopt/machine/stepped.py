@@ -54,7 +54,7 @@ ROUNDING = 2.0  # times the std that rounding leaves by the estimate: a mismatch
 HEAD = 400  # rows that tell the state at the first
 HEAD_DECAYS, LONGEST_HEAD = 3.0, 20000  # time constants of the slowest part that they last besides, and rows at most
 INTEGRATES = 1e-6  # distance from 1 of a pole that does not decay
-LEVELS = 200  # of a reference that is taken for rounded; what has fewer is steps
+LEVELS, MOVING = 200, 0.5  # of a reference that is taken for rounded; what has fewer, and moves in fewer rows, is steps
 LONGEST_RESPONSE = 5000  # rows after which an impulse has left what the integrals hold of it
 Source = Controller | ScheduledController | ForceMPC
 Others = Mapping[str, Controller | ScheduledController]  # laws that may have run in a law's place, by name
@@ -335,6 +335,14 @@ def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, "
     return np.linalg.lstsq(modes, left[~limited] * weight, rcond=1e-10)[0]
 
 
+def is_rounded(reference: Float[np.ndarray, " n"]) -> bool:
+    """Tell whether a reference may be logged with fewer digits than the law was given: not where it is steps, which
+    has few values and stays at each.
+    """
+    moves = float(np.mean(np.diff(reference) != 0.0)) if reference.size > 1 else 0.0
+    return np.unique(reference).size >= LEVELS or moves > MOVING
+
+
 def _allow(law: RunnableLaw, ticks: Ticks, log: Ticks, *, rounded: bool) -> tuple[Float[np.ndarray, " n"], float]:
     """Return one std of what rounding allows at each row, of the command and of what the law saw if that is `rounded`
     in the log, and its rms within stretches.
@@ -344,7 +352,7 @@ def _allow(law: RunnableLaw, ticks: Ticks, log: Ticks, *, rounded: bool) -> tupl
     n, integrals = len(ticks), count_integrals(law)
     response = find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
     steps: list[Any] = []
-    if np.unique(log.reference).size >= LEVELS:
+    if is_rounded(log.reference):
         steps.append((law.b_reference, law.d_reference, ticks.reference, log.reference))
     columns = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
     steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i], log.measured[:, i]) for i in range(law.measured)]

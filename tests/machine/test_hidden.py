@@ -93,6 +93,22 @@ def test_shares_are_as_the_rounding_of_a_right_law_scatters_them(knee, benches):
     assert np.max(np.abs(scores)) < 4.0 and 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.6, scores
 
 
+def test_the_rounding_of_a_reference_that_repeats_is_the_same_each_time(knee, benches):
+    """Twenty times the same errors are no twenty times as many: such shares were said to stand out by 6 to 10 std."""
+    law, machine = knee
+    bare = make_law(law, replace(read_gains(law), observer=None))
+    scores = []
+    for seed in range(8):
+        periodic = multisine(1000, LINES, 20, 1.0, seed)
+        log = benches["law"].log(machine, periodic, noise=0.02, seed=seed, decimals=4)
+        columns = {"reference": np.round(log["reference"], 2), "I": log["I"], "tau_s": log["tau_s"]}
+        setting = make_setting(law, take_ticks(law, so.Log.from_arrays(time=log.time, **columns)))
+        match, changed = play(setting), bare(setting)
+        share, std = Segments.make(setting, match).find_share(changed.linear, play(changed).commands - match.commands)
+        scores.append(share / std)
+    assert np.max(np.abs(scores)) < 4.0, scores
+
+
 def test_a_gain_that_is_a_little_off_has_its_size(knee, benches):
     law, machine = knee
     (row,) = so.accept(law, [record(benches["weak"], machine, 1, decimals=2)]).replays
