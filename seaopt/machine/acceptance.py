@@ -24,10 +24,11 @@ from seaopt.machine.differences.certified import Differences, compare
 from seaopt.machine.differences.rate_of_commands import find_rate
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
-from seaopt.machine.response.periods import Blocks, Played, cut_periods, find_refused, join_blocks
+from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand
-from seaopt.machine.ticks import Gaps, Ticks, take_ticks
+from seaopt.machine.ticks import FEWEST, Gaps, Ticks, take_ticks
+from seaopt.machine.tripped import find_refused, find_trip
 from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
 from seaopt.robustness import check_ranges
@@ -44,6 +45,7 @@ OUTER_LOOP = (
     "own leave it out, with the link as in the design plant, and give the law the reference of the bring-up itself"
 )
 OTHER_LAW = "the logs are not of this law; mend that first, then record again"
+TRIPPED = "the gate tripped before the reference had repeated often enough; record all of it again"
 UNTOLD_LAW = "the logs do not tell whether they are of this law"
 ACCEPTANCE_SCHEMA = "seaopt/acceptance/1"
 
@@ -235,8 +237,11 @@ def accept(
         if chosen.gaps is not None and chosen.rendered is None and row.met and row.ticks_per_row == 1:
             (whole,) = list_ticks(controller, [log], reference, at, whole=True)
             row = replay_stretches(controller, row, chosen, whole, others or {})
+        row = _check_header(controller, log, row, others or {})
+        if row.met and row.ticks_per_row == 1:
+            row = replace(row, trip=find_trip(stand(controller, chosen.middle), chosen))
         rows.append(chosen)
-        replays.append(_check_header(controller, log, row, others or {}))
+        replays.append(row)
     law = stand(controller, rows[0].middle)
     place = None
     if isinstance(controller, ScheduledController) and rows[0].middle is not None:
@@ -244,8 +249,8 @@ def accept(
     sources = tuple(log.source for log in logs)
     experiments = tuple(
         replace(make_experiment(law, ticks, row.command_late), law=_hash(controller))
-        for ticks, row in zip(rows, replays, strict=True)
-        if row.met and row.ticks_per_row == 1 and ticks.rendered is None  # behind an outer loop is another plant
+        for ticks, row in zip((_end_at_trip(law, ticks) for ticks in rows), replays, strict=True)
+        if row.met and _shows_machine(ticks, row)
     )
     result = Acceptance(
         controller=law,
@@ -259,7 +264,7 @@ def accept(
         told = any(not row.met and not row.undecided for row in replays)
         return replace(result, left_out={"response": OTHER_LAW if told else UNTOLD_LAW})
     rows = [
-        _take_whole(controller, log, ticks, row, reference, at) if row.ticks_per_row == 1 else ticks
+        _end_at_trip(law, _take_whole(controller, log, ticks, row, reference, at)) if row.ticks_per_row == 1 else ticks
         for log, ticks, row in zip(logs, rows, replays, strict=True)
     ]
     blocks, left_out = list[Blocks](), dict[str, str]()
@@ -267,14 +272,16 @@ def accept(
         try:
             if ticks.rendered is not None:
                 raise LogError(OUTER_LOOP)
+            if len(ticks) < FEWEST:
+                raise LogError(TRIPPED)
             refused = find_refused(law, ticks) if row.ticks_per_row == 1 else None
             cut = cut_periods(law, ticks if place is None else require_still(controller, ticks), refused, played)
             blocks.append(shift_command(law, cut, row.command_late) if row.ticks_per_row > 1 else cut)
         except LogError as error:
-            left_out[ticks.source] = str(error)
+            left_out[ticks.source] = str(error) if row.trip is None else TRIPPED
     if not blocks:
         pairs = zip(rows, replays, strict=True)
-        told = [find_rate(law, ticks) for ticks, row in pairs if row.ticks_per_row == 1 and ticks.rendered is None]
+        told = [find_rate(law, ticks) for ticks, row in pairs if _shows_machine(ticks, row)]
         stepped = next((each for each in told if each is not None), None)
         kept = () if stepped is not None else result.experiments  # whose clock is wrong
         return replace(result, left_out=left_out, stepped=stepped, experiments=kept)
@@ -300,6 +307,17 @@ def _take_whole(source: Source, log: Log, ticks: Ticks, row: Replay, reference: 
     if ticks.gaps is not None and ticks.rendered is None:
         (ticks,) = list_ticks(source, [log], reference, at, whole=True)
     return ticks.move_command(row.command_late) if row.command_late else ticks
+
+
+def _shows_machine(ticks: Ticks, row: Replay) -> bool:
+    """Tell whether a log has what the machine made of each command; behind an outer loop is another plant."""
+    return row.ticks_per_row == 1 and ticks.rendered is None and len(ticks) >= FEWEST
+
+
+def _end_at_trip(law: Controller, ticks: Ticks) -> Ticks:
+    """Return the ticks before the readings of which the law's gate made a fault."""
+    trip = find_trip(law, ticks)
+    return ticks if trip is None else ticks.take(slice(0, trip.row))
 
 
 def _check_header(source: Source, log: Log, row: Replay, others: Others) -> Replay:

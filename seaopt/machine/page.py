@@ -17,7 +17,7 @@ from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import LEAST_PHASES, SHORT_BY, Judged, Measured, Response
 from seaopt.machine.ticks import AT_LIMIT, Gaps
-from seaopt.machine.wording import say_cause, say_difference, say_missing
+from seaopt.machine.wording import say_cause, say_difference, say_missing, say_trip
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -116,6 +116,8 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     """Return the verdict on an acceptance."""
     off = [(source, row) for source, row in zip(result.sources, result.replays, strict=True) if not row.met]
     reasons = [Reason(what=_say_mismatch(row, result), where=source) for source, row in off]
+    trips = zip(result.sources, result.replays, strict=True)
+    reasons += [Reason(what=say_trip(result.controller, row.trip), where=source) for source, row in trips if row.trip]
     count = format_count(len(result.sources), "log")
     parts = [f"the law makes the logged command in {len(result.sources) - len(off)} of {count}"]
     response, differences = result.response, result.differences
@@ -127,7 +129,7 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
             parts.append("dry friction held the motor, so that they are of the stuck machine alone")
         reasons += [Reason(what=_say_refuted(row)) for row in limited if row.outcome == "refuted"]
         if counts["undecided"]:
-            reasons.append(Reason(what=f"the log does not decide {_say_undecided(response)}"))
+            reasons.append(Reason(what=f"the log does not decide {_say_undecided(result, response)}"))
     if differences is not None and not differences.inside:
         parts.append(_say_inside(result, differences))
         reasons.append(Reason(what=_say_best(differences)))
@@ -200,20 +202,22 @@ def _say_refuted(row: Judged) -> str:
     return f"{limit}: {format_number(row.value, 3)} ({_show_interval(row)}){at}"
 
 
-def _say_undecided(response: Response) -> str:
+def _say_undecided(result: Acceptance, response: Response) -> str:
     """Return of which limits a log does not say enough, and what to record so that it does."""
     rows = [row for row in response.judged if row.limit is not None and row.outcome == "undecided"]
     near = [_say_near(row) for row in rows if row.near is not None]
     rows = [row for row in rows if row.near is None]
-    record: list[str] = []
-    if response.needs_phases:
+    tripped = any(row.trip is not None for row in result.replays)
+    record: list[str] = ["all of the reference again, without a trip of the gate"] if tripped else []
+    if response.needs_phases and not tripped:
         below = (
             " and with the command below its limit" if any(part.left_out.limit for part in response.measured) else ""
         )
         record.append(f"{LEAST_PHASES} sets of random phases{below}, which dry friction asks for")
     if response.needs_lines is not None:
         record.append(say_missing(response.needs_lines, response.missing))
-    if periods := max((row.periods or 0 for row in rows), default=0):
+    periods = 0 if tripped else max((row.periods or 0 for row in rows), default=0)
+    if periods:
         record.append(f"{periods} periods in all ({format_number(periods * response.period_s, 3)} s)")
     wanted = join_words(record) or "more periods, or a larger reference"
     others = [f"{join_words([_name(row) for row in rows])}: record {wanted}"] if rows else []
@@ -301,7 +305,9 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     if response.at_amplitude_only:
         remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
     if any(row.outcome == "undecided" for row in response.judged if row.limit is not None):
-        remarks.append(f"Undecided is no doubt about the machine: the log does not decide {_say_undecided(response)}.")
+        remarks.append(
+            f"Undecided is no doubt about the machine: the log does not decide {_say_undecided(result, response)}."
+        )
     remarks += [f"Left out: {text}" for text in result.left_out.values()]
     items = tuple(_warn_left_out(part) for part in response.measured if part.left_out.total)
     tables = (Table(head=head, rows=rows, align="<<>>>>>>", optional=("periods needed",)),)
@@ -404,6 +410,12 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         _say_gaps(Path(source).name, gaps, row)
         for source, gaps, row in zip(result.sources, result.gaps, result.replays, strict=True)
         if gaps
+    )
+    remarks += tuple(
+        f"In {Path(source).name} {say_trip(result.controller, row.trip)}. What comes after is left out of the response "
+        "and of the log for a fit."
+        for source, row in zip(result.sources, result.replays, strict=True)
+        if row.trip
     )
     remarks += tuple(
         f"{Path(source).name} does not exclude that {', or that '.join(map(say_cause, row.possible))}."

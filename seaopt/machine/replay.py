@@ -20,6 +20,7 @@ from seaopt.machine.open_loop import find_unfollowed
 from seaopt.machine.stepped import FLOOR, Match, Others, Setting, Source, make_setting, play
 from seaopt.machine.stopped import find_stop
 from seaopt.machine.ticks import Ticks, find_saturated
+from seaopt.machine.tripped import Trip
 from seaopt.records import record
 
 SIGMAS = 4.0  # of what rounding allows
@@ -48,6 +49,7 @@ class Replay:
     command_mostly: float = 0.0
     possible: tuple[Cause, ...] = ()  # of a log with every n-th tick: laws with other parts that it does not exclude
     stretches: int = 1  # between its gaps
+    trip: Trip | None = None  # of the law's gate: what comes after it is no longer of the law
 
     @property
     def explained(self) -> bool:

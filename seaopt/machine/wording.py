@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from seaopt.control import Controller
 from seaopt.formatting import format_number, join_words
 from seaopt.machine.causes import Cause
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.free_gains import SAME_GAINS
 from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band
+from seaopt.machine.tripped import Trip
 from seaopt.units import unit_after
 
 EVERY_TICK = "of a log with every n-th tick"
@@ -98,6 +100,23 @@ def say_cause(cause: Cause) -> str:
             return f"it is the law of {cause.what}"
         case _:
             return f"the {cause.kind} is {cause.what}"
+
+
+def say_trip(controller: Controller, trip: Trip) -> str:
+    """Return when a gate tripped, what of, and for how long the law was stopped."""
+    assert controller.gate is not None
+    unit, (low, high) = unit_after(controller.command.reference_unit), map(format_number, controller.gate.range_N)
+    step = format_number(controller.gate.max_step_N)
+    why = {
+        "range": f"outside its range, {low} to {high}{unit}",
+        "step": f"more than its largest step, {step}{unit} a tick, from the one before",
+        "encoders": "that do not agree with the encoders",
+    }[trip.why]
+    return (
+        f"the gate tripped at {trip.at_s:.3f} s, of {trip.readings} readings in a row {why} (the last "
+        f"{format_number(trip.reading)}{unit}), and the law was stopped for the rest, {trip.stopped_s:.4g} s: look at "
+        "the sensor and its cable, or at the gate where the readings are true"
+    )
 
 
 def _say_gains(cause: Cause) -> str:

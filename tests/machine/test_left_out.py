@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import PlausibilityGate
+from seaopt.control import PlausibilityGate, runnable
 from seaopt.files import to_json
 from seaopt.machine.page import write_acceptance_page
 from seaopt.machine.response.periods import Played, shorten
@@ -62,6 +62,58 @@ def test_periods_in_which_the_gate_did_not_believe_a_reading_are_counted(compile
     assert record["response"]["measured"][0]["left_out"] == {"limit": 0, "gate": refused, "gap": 0}
     says = f"in {refused} of them the gate did not believe a reading"
     assert says in terminal and says in page
+
+
+def trip(compiler, controller, folder, first, reading=9000.0):
+    """Return a law with a gate, and the log of its C in which the sensor fails in a row: readings that stay at a value,
+    and what the law steps make of them.
+    """
+    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_A_per_s=50.0)
+    gated = replace(controller, gate=gate)
+    log = Bench(compiler, folder, gated, "gated").log(Machine(), REFERENCE)
+    force, law = np.where(np.arange(len(log)) < first, log["F1"], reading), runnable(gated, gate=gate)
+    state, current = law.reset(), np.empty(len(log))
+    for k, (goal, read) in enumerate(zip(log["reference"].tolist(), force.tolist(), strict=True)):
+        current[k], state = law.step(state, goal, read)
+    assert np.allclose(current[:first], log["I"][:first], atol=1e-6)
+    return gated, so.Log.from_arrays(time=log.time, source="bench", reference=log["reference"], F1=force, I=current)
+
+
+def test_a_gate_that_tripped_is_named_with_when_and_the_log_ends_before_it(compiler, controller, tmp_path):
+    first = 6300
+    gated, log = trip(compiler, controller, tmp_path, first)
+    result = so.accept(gated, [log])
+    terminal, page, record = read_everywhere(result, tmp_path)
+    told = record["replay"]["logs"][0]["trip"]
+    assert result.replayed and np.all(log["I"][first + 500 :] == 0.0)
+    assert told["row"] == first and (told["readings"], told["reading"], told["why"]) == (4, 9000.0, "range")
+    assert told["at_s"] == pytest.approx(1e-3 * (first + 3)) and told["stopped_s"] == pytest.approx(10.0 - told["at_s"])
+    (part,) = record["response"]["measured"]
+    assert part["periods"] == 5 and part["left_out"] == {"limit": 0, "gate": 0, "gap": 0}
+    (experiment,) = result.experiments
+    assert first - 2 <= len(experiment) <= first and experiment["F1"][-1] == log["F1"][first - 1]
+    says = f"the gate tripped at {1e-3 * (first + 3):.3f} s, of 4 readings in a row outside its range, -1500 to 1500 N"
+    assert says in terminal and says in page and "the law was stopped for the rest" in terminal
+
+
+@pytest.mark.parametrize("rows", [1, 20, 800, 1500])
+def test_a_gate_that_tripped_too_early_for_a_response_is_why_there_is_none(compiler, controller, tmp_path, rows):
+    gated, log = trip(compiler, controller, tmp_path, rows)
+    result = so.accept(gated, [log])
+    says = " ".join(repr(result).split())
+    assert result.response is None and not result.met and result.replays[0].trip is not None
+    assert "no response: the gate tripped before" in says and "the gate tripped at" in says
+    assert len(result.experiments) == (rows > 100)
+
+
+def test_after_a_trip_it_is_not_asked_for_what_the_log_has(compiler, controller, tmp_path):
+    """Of a log that decides nothing, as with dry friction and few sets of phases before the trip."""
+    gated, log = trip(compiler, controller, tmp_path, 4300)
+    result = so.accept(gated, [log])
+    judged = tuple(replace(row, outcome="undecided", periods=12, near=None) for row in result.response.judged)
+    says = " ".join(repr(replace(result, response=replace(result.response, judged=judged, needs_phases=True))).split())
+    assert "record all of the reference again, without a trip of the gate" in says
+    assert "sets of random phases" not in says and "periods in all" not in says
 
 
 def lose(log, rows):

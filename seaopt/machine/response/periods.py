@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from seaopt.control import Controller, GateState
+from seaopt.control import Controller
 from seaopt.errors import LogError
 from seaopt.formatting import format_count, join_words
 from seaopt.machine.response.runaway import say_runaway
@@ -209,21 +209,6 @@ def _say_aperiodic(lasts_s: float, played: Played | None) -> str:
         "from noise: it has no period, or the log is shorter than two of them; play a periodic multisine as the "
         "reference, and record at least 3 periods"
     )
-
-
-def find_refused(controller: Controller, ticks: Ticks) -> Bool[np.ndarray, " n"]:
-    """Tell in which rows the gate of a law does not believe what it reads."""
-    gate, refused, state = controller.gate, np.zeros(len(ticks), dtype=bool), GateState()
-    if gate is None:
-        return refused
-    read, encoders = ticks.measured[:, 0], [ticks.further[:, controller.further.index(name)] for name in gate.reads]
-    for k, row in enumerate(zip(read.tolist(), *(each.tolist() for each in encoders), strict=True)):
-        if not all(map(math.isfinite, row)):  # a gap: what was held before it is not known
-            state = GateState()
-            continue
-        _, state = gate.screen(state, row[0], row[1:])
-        refused[k] = state.held > 0
-    return refused
 
 
 def cut_periods(
