@@ -204,7 +204,8 @@ def _list_units(controller: Controller) -> dict[str, str]:
     read = {name: outputs.get(name, command.reference_unit) for name in names}
     if controller.outer is not None:
         read.setdefault(controller.outer.position, controller.outer.place_unit)
-    return {REFERENCE: command.reference_unit, command.input: command.unit, **read}
+    reference = "" if controller.renders else command.reference_unit  # with an outer loop it may be a place, too
+    return {REFERENCE: reference, command.input: command.unit, **read}
 
 
 def _find_others(folder: Path, own: Path) -> dict[str, Controller | ScheduledController]:

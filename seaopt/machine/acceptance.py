@@ -27,7 +27,7 @@ from seaopt.machine.replay import Replay, replay, replay_stretches
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand
-from seaopt.machine.ticks import FEWEST, Gaps, Ticks, take_ticks
+from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference_unit, take_ticks
 from seaopt.machine.tripped import find_refused, find_trip
 from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
@@ -229,11 +229,14 @@ def accept(
     rows, replays = list[Ticks](), list[Replay]()
     for log, ticks in zip(logs, list_ticks(controller, logs, reference, at), strict=True):
         tried, outer = [(ticks, replay(controller, ticks, others))], stand(controller, at).outer
-        if not tried[0][1].met and outer is not None and not outer.stiffness and outer.position in log.signals:
+        unclear = outer is not None and outer.stiffness and find_reference_unit(log, reference) in ("", "-")
+        may_be_outer = outer is not None and outer.position in log.signals and (unclear or not outer.stiffness)
+        if not tried[0][1].met and may_be_outer:
             with suppress(LogError):  # the position has gaps
                 (before,) = list_ticks(controller, [log], reference, at, before=True)
                 tried.append((before, replay(controller, before, others)))
         chosen, row = max(tried, key=lambda pair: (pair[1].met, pair[1].explained, pair[1].undecided))
+        row = replace(row, unit_missing=bool(unclear) and not row.met and not row.explained)
         if chosen.gaps is not None and chosen.rendered is None and row.met and row.ticks_per_row == 1:
             (whole,) = list_ticks(controller, [log], reference, at, whole=True)
             row = replay_stretches(controller, row, chosen, whole, others or {})

@@ -106,6 +106,10 @@ HIDDEN = (
     "of the rounding of the whole log by {} std."
 )
 AND = "with the first one also: "
+NO_UNIT = (
+    "the column of the reference states no unit: write [{}] in its header if it is x_0, which the outer loop was "
+    "given, or [{}] if it is what the law was given, and judge again"
+)
 UNCERTIFIED = {
     "missing": "not certified: there is no certificate of this law",
     "failed": "not certified: the certificate of this law FAILED",
@@ -239,6 +243,13 @@ def _show_interval(row: Judged) -> str:
 
 
 def _say_mismatch(row: Replay, result: Acceptance) -> str:
+    said, outer = _say_off(row, result), result.controller.outer
+    if not row.unit_missing or outer is None:
+        return said
+    return f"{NO_UNIT.format(outer.place_unit, result.controller.command.reference_unit)}; {said}"
+
+
+def _say_off(row: Replay, result: Acceptance) -> str:
     unit = unit_after(result.controller.command.unit)
     if row.undecided or (row.causes and row.causes[0].explains):
         return say_cause(row.causes[0])

@@ -50,6 +50,7 @@ class Replay:
     possible: tuple[Cause, ...] = ()  # of a log with every n-th tick: laws with other parts that it does not exclude
     stretches: int = 1  # between its gaps
     trip: Trip | None = None  # of the law's gate: what comes after it is no longer of the law
+    unit_missing: bool = False  # of the reference, which may be the law's own or that of its outer loop
 
     @property
     def explained(self) -> bool:

@@ -132,15 +132,15 @@ def take_ticks(
 ) -> Ticks:
     """Return the ticks of a log whose channels carry the names of the controller's signals, of the input that it
     commands, and of its reference. `over`: the variable of its schedule, which was `at` a value where the log does not
-    have it. `before`: the reference is a force, to which its outer loop without a stiffness adds the damping.
+    have it. `before`: the reference is what its outer loop is given, though it has no unit, or is a force.
     `whole`: all of the log, in place of its longest stretch without a gap. Raises LogError: a channel is missing, or no
     stretch is long enough.
     """
     command, names = controller.command, (*controller.signals, *controller.further)
     called = [reference] if reference is not None else [name for name in REFERENCES if name in log.signals]
     around = controller.outer if controller.renders or before else None
-    given = log.signal(called[0]).unit if called and called[0] in log.signals else None
-    if around is not None and controller.renders and given not in (None, around.place_unit):
+    given = find_reference_unit(log, reference)
+    if around is not None and not before and given not in (None, around.place_unit):
         around = None  # the force law's own reference, whatever it comes from
     if around is not None:
         names = tuple(dict.fromkeys((*names, around.position)))
@@ -191,6 +191,12 @@ def take_ticks(
         gaps=gaps,
     )
     return ticks if around is None else _render(ticks, around, table[:, 2 + names.index(around.position)])
+
+
+def find_reference_unit(log: Log, reference: str | None) -> str | None:
+    """Return the unit that a log's reference states; None where there is no such channel."""
+    names = [name for name in ((reference,) if reference is not None else REFERENCES) if name in log.signals]
+    return log.signal(names[0]).unit if names else None
 
 
 def _take_beside(controller: Controller, log: Log, rows: Any, whole: bool) -> dict[str, Float[np.ndarray, " n"]]:

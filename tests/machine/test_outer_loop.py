@@ -75,6 +75,12 @@ def make_log(rows, *, inner=False, position=True, unit="rad"):
     return so.Log.from_arrays(time=T * np.arange(len(rows)), units=units, source="knee", **columns)
 
 
+def replace_reference(log, values):
+    columns = {name: log[name] for name in log.signals} | {"reference": values}
+    units = {name: log.signal(name).unit for name in log.signals}
+    return so.Log.from_arrays(time=log.time, units=units, source=log.source, **columns)
+
+
 GOAL = 0.1 * np.sin(2.0 * np.pi * np.arange(4000) * T) + 0.05 * (np.arange(4000) // 1000 % 2)
 FORCE = 20.0 * GOAL  # N m
 
@@ -87,6 +93,24 @@ def test_the_outer_loop_is_replayed_with_the_law(impedance, first):
     assert row.met and row.mismatch < 1e-3 * row.rms, row
     assert result.response is None and "leave it out" in result.left_out["knee"]
     assert so.accept(impedance, [make_log(rows, inner=True, position=False)]).replayed
+
+
+def test_a_reference_without_a_unit_is_what_the_command_is_made_of(impedance):
+    rows = run(impedance, GOAL)
+    for unit, inner in (("-", False), ("-", True), ("", False)):
+        log = make_log(rows, unit=unit)
+        log = replace_reference(log, rows[:, 1]) if inner else log
+        (row,) = so.accept(impedance, [log]).replays
+        assert row.met and not row.unit_missing, (unit, inner)
+
+
+def test_where_neither_makes_the_command_the_unit_is_asked_for(impedance):
+    rng, rows = np.random.default_rng(4), run(impedance, GOAL)
+    rows[:, 0] += 0.05 * rng.normal(size=len(rows))  # another reference than the law was given
+    result = so.accept(impedance, [make_log(rows, unit="-")])
+    assert result.replays[0].unit_missing and not result.met
+    text = " ".join(str(result).split())
+    assert "write [rad] in its header if it is x_0" in text and "or [N m] if" in text
 
 
 @pytest.mark.parametrize(
