@@ -8,11 +8,23 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import CompensateFriction, add_compensation, runnable
+from seaopt.control import (
+    CompensateFriction,
+    CompensateGravity,
+    LinkFeedforward,
+    SampledLoop,
+    add_compensation,
+    compensate_schedule,
+    run_loop,
+    runnable,
+    tune_schedule,
+)
 from seaopt.control.loops.compensation.terms import SOURCES
 from seaopt.control.running.law_step import run_law
 from seaopt.machine.bringup.excitation import design_excitation
-from tests.machine.simulator import Bench, Machine
+from seaopt.machine.response.periods import cut_periods
+from seaopt.machine.ticks import take_ticks
+from tests.machine.simulator import Bench, Machine, multisine
 
 FRICTION = 40.0
 MACHINE = replace(Machine(), coulomb=FRICTION, smoothing=5e-3)
@@ -77,3 +89,47 @@ def test_doubled_friction_is_named_beside_its_compensation(compensated):
     first = result.differences.found[0]
     factors = dict(zip((first.name, *first.alike), (first.value, *first.alike_values), strict=True))
     assert not result.met and np.isclose(factors["f_c"], 2.0, rtol=0.1) and first.explains > 0.95, result
+
+
+def test_a_schedule_is_measured_without_its_terms_where_it_stood(compiler, tmp_path):
+    values = so.plants.thor().update(f_c=FRICTION, v_s=5e-3)
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0)
+    schedule = tune_schedule(so.plants.high_impedance(), values, spec, "k", [5e5, 8e5])
+    schedule = compensate_schedule(schedule, friction=CompensateFriction(fraction=0.7))
+    place = MACHINE.stiffness
+    reference = play(schedule.at(place), SHARES[1]).reference
+    log = Bench(compiler, tmp_path, schedule).log(MACHINE, reference, noise=0.5, places=np.full(reference.size, place))
+    result = so.accept(schedule, [log], uncertainty=values, ranges=RANGES)
+    assert result.met and result.differences.inside and not result.differences.found, result
+
+
+@pytest.mark.parametrize("fed", [None, LinkFeedforward()])
+def test_what_the_linear_part_makes_is_the_command_less_every_term(fed):
+    """Of friction from the speed and of a link's weight, with the link fed forward, on a link that moves."""
+    swing, values = so.plants.moving_output(), so.plants.thor().update(d=2.0, f_c=FRICTION, v_s=5e-3)
+    spec = so.ControllerSpec(
+        bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0, link_feedforward=fed
+    )
+    law = so.tune(swing if fed else so.plants.high_impedance(), values, spec)
+    friction, gravity = CompensateFriction(fraction=0.7, source="speed"), CompensateGravity(fraction=0.9)
+    law = add_compensation(law, friction=friction, gravity=gravity, link=(swing, values))
+    lines = np.unique(np.round(np.geomspace(2, 120, 25)).astype(int))
+    reference = multisine(1000, lines, 16, 20.0, 3)  # the link comes to rest in its swing
+    loop = SampledLoop(plant=swing, law=runnable(law), measured=law.signals, delay_samples=1)
+    run = run_loop(loop, [swing.complete(values).drop_conditions()], reference)
+    columns = {name: run.outputs[name][0][:-1] for name in {*law.signals, *law.further}}
+    log = so.Log.from_arrays(
+        time=1e-3 * np.arange(reference.size - 1), reference=reference[:-1], I=run.current[0][1:], **columns
+    )  # the command of a row is put out in the next one
+    ticks, memory, terms = take_ticks(law, log), (0.0, 0.0), list[tuple[float, float]]()
+    for asked, readings in zip(ticks.reference, ticks.further[:, : len(law.compensation.reads)].tolist(), strict=True):
+        shaped, added, memory = law.compensation.step(memory, asked, readings)
+        terms.append((shaped - asked, added))
+    weight, rubs = law.per_effort * np.transpose(terms)
+    whole = cut_periods(law, ticks)
+    responses = law.law.responses(whole.f)
+    less = cut_periods(law, replace(ticks, command=ticks.command - rubs)).effort
+    less -= responses[0] * cut_periods(law, replace(ticks, command=weight)).effort
+    made = whole.make_efforts(responses)
+    off, terms_are = np.abs(made - less)[-1] / np.abs(less)[-1], np.abs(whole.effort - less)[-1] / np.abs(less)[-1]
+    assert np.max(off) < 1e-4 and np.max(terms_are) > 0.1
