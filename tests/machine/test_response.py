@@ -125,6 +125,12 @@ def test_a_law_at_another_rate_is_named_by_its_response_where_the_clock_of_the_l
     first = result.differences.found[0]
     assert result.replayed and not result.met and not result.experiments
     assert (first.kind, first.value) == ("rate", 1e3 * rate) and f"stepped at {1e3 * rate:g} Hz" in str(result)
+    judged = tuple(replace(row, outcome="undecided", periods=12) for row in result.response.judged)
+    open_ = replace(result.response, judged=judged, needs_lines=(3.0, 50.0), missing=((3.0, 50.0),))
+    said = " ".join(str(replace(result, response=open_)).split())
+    assert "record again once the law is stepped at its rate" in said
+    assert "lines from 3 to 50 Hz" not in said and "periods in all" not in said
+    assert said.index("the law is stepped at") < said.index("the log does not decide")
 
     import control
 

@@ -38,7 +38,12 @@ def test_up_to_which_command_the_log_judges_is_data_and_said(judged, tmp_path):
     ("value", "says"),
     [
         (15.0, "a larger reference comes nearer"),
-        (31.0, "which is what was asked"),
+        (31.0, "it is 31 Hz (27.9 to 34.1), which is what was asked"),
+        (29.0, "it is 29 Hz (26.1 to 31.9), which is what was asked"),
+        (
+            27.1,
+            "it is 27.1 Hz (24.4 to 29.8), which is less than was asked and no less than the 27 Hz that are allowed",
+        ),
         (66.0, "2.2 times what was asked"),
     ],
 )
@@ -46,7 +51,9 @@ def test_up_to_which_command_the_log_judges_is_data_and_said(judged, tmp_path):
 def test_a_stuck_bandwidth_is_said_beside_what_was_asked(judged, value, says, limit, little):
     _, result = judged
     rows = [
-        replace(row, state="stuck", value=value, limit=limit) if row.name == "bandwidth" else row
+        replace(row, state="stuck", value=value, low=0.9 * value, high=1.1 * value, limit=limit)
+        if row.name == "bandwidth"
+        else row
         for row in result.response.judged
     ]
     text = " ".join(repr(replace(result, response=replace(result.response, judged=tuple(rows)))).split())
