@@ -216,7 +216,7 @@ def find_peaks(loop: Products, by: Levels) -> tuple[Peaks, Peaks]:
     z = np.exp(1j * theta)
     s = loop.sensitivity(z)
     values = np.concatenate([np.abs(s), np.abs(1.0 - s)])
-    even = z.imag < SAME_ANGLE  # a curve at 0 and at half the rate: the grid has the value
+    even = np.imag(z) < SAME_ANGLE  # a curve at 0 and at half the rate: the grid has the value
     counts = np.isfinite(by.T.reshape(-1, 1)) & ~np.concatenate([even, even])
     rows, points = _list_maxima(values, counts)
     at, count = rows % len(theta), len(theta)
