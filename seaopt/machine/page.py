@@ -218,8 +218,10 @@ def _say_undecided(result: Acceptance, response: Response) -> str:
     rows = [row for row in response.judged if row.limit is not None and row.outcome == "undecided"]
     if response.rate != 1.0:  # of these lines no more is needed: they are others once the timer is right
         return f"{join_words([_name(row) for row in rows])}: record again once the law is stepped at its rate"
-    near = [_say_near(row) for row in rows if row.near is not None]
-    rows = [row for row in rows if row.near is None]
+    # a loop that is mended is another one, which other periods decide
+    refuted = any(row.limit is not None and row.outcome == "refuted" for row in response.judged)
+    near = [] if refuted else [_say_near(row) for row in rows if row.near is not None]
+    rows = rows if refuted else [row for row in rows if row.near is None]
     tripped = any(row.trip is not None for row in result.replays)
     record: list[str] = ["all of the reference again, without a trip of the gate"] if tripped else []
     if response.needs_phases and not tripped:
@@ -229,11 +231,12 @@ def _say_undecided(result: Acceptance, response: Response) -> str:
         record.append(f"{LEAST_PHASES} sets of random phases{below}, which dry friction asks for")
     if response.needs_lines is not None:
         record.append(say_missing(response.needs_lines, response.missing))
-    periods = 0 if tripped else max((row.periods or 0 for row in rows), default=0)
+    periods = 0 if tripped or refuted else max((row.periods or 0 for row in rows), default=0)
     if periods:
         record.append(f"{periods} periods in all ({format_number(periods * response.period_s, 3)} s)")
-    wanted = join_words(record) or "more periods, or a larger reference"
-    others = [f"{join_words([_name(row) for row in rows])}: record {wanted}"] if rows else []
+    wanted = join_words(record) or ("again" if refuted else "more periods, or a larger reference")
+    first = "mend what is refuted first, then " if refuted else ""
+    others = [f"{join_words([_name(row) for row in rows])}: {first}record {wanted}"] if rows else []
     return "; ".join([*others, *near])
 
 

@@ -221,6 +221,16 @@ def test_lines_that_miss_the_crossover_confirm_nothing_and_the_row_says_which_to
     assert says.format(low=low, high=high) in " ".join(repr(result).split())
 
 
+def test_where_a_limit_is_refuted_no_periods_are_asked_for_another(controller, bench):
+    """Noise leaves Mt open beside Ms, which is refuted: its periods are of a loop that is to be mended."""
+    log = bench.log(replace(Machine(), delay_s=1e-3), REFERENCE[:4000], noise=3.0)
+    result = so.accept(controller, [log])
+    outcomes = [row.outcome for row in result.response.judged if row.limit is not None]
+    assert "refuted" in outcomes and any(row.periods for row in result.response.judged)
+    words = " ".join(str(result).split())
+    assert "mend what is refuted first, then record again" in words and "periods in all" not in words
+
+
 def test_phases_are_told_apart_and_the_first_period_of_each_is_left_out(controller, bench):
     reference = np.concatenate([multisine(1000, LINES, 3, 60.0, seed, bias=300.0) for seed in range(6)])
     assert find_period(reference) == 1000
