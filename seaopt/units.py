@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 
 DIMENSIONLESS = frozenset({"", "-", "1"})
 CELSIUS = frozenset({"degC", "°C", "celsius", "Celsius", "C"})  # a log has temperatures, and no charges in coulombs
+# Steps of an encoder or a converter, which are a pure number.
+COUNT_UNITS = frozenset(
+    {"counts", "count", "ticks", "cnt", "inc", "incr", "increments", "ink", "inkr", "inkremente", "lsb", "steps"}
+)
 # What pint would read otherwise (Nm as a textile's length per mass, Grad as a gigaradian), or not at all.
 _SYNONYMS = {
     "usec": "us", "msec": "ms", "nsec": "ns", "secs": "s", "Ohm": "ohm", "degC": "degC",
@@ -52,8 +56,13 @@ def _registry() -> pint.UnitRegistry[Any]:
 def _pint_text(unit: str) -> str:
     """Rewrite an engineer's unit text ("kg m^2", "N m s/rad") as one that pint parses."""
     text = unit.strip().replace("·", "*").replace("µ", "u").replace("μ", "u").replace("°", "deg")
-    text = _TOKEN.sub(lambda token: _SYNONYMS.get(token.group(0), token.group(0)), text)
+    text = _TOKEN.sub(lambda token: _name_unit(token.group(0)), text)
     return re.sub(r"(?<=[\w)])\s+(?=[A-Za-z(])", "*", text)
+
+
+def _name_unit(word: str) -> str:
+    """Return the name that pint has for a unit."""
+    return "count" if word.lower() in COUNT_UNITS else _SYNONYMS.get(word, word)
 
 
 @lru_cache(maxsize=256)

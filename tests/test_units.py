@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+import seaopt as so
 from seaopt import units
 from seaopt.errors import UnitError
 from seaopt.plants.equations.declaration import PLAIN_UNIT
@@ -96,3 +97,10 @@ def test_units_that_are_looked_up(unit):
 def test_usual_units_need_no_pint():
     code = "import sys; from seaopt.units import factor, si_unit; factor('deg', 'rad'); sys.exit('pint' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("unit", ["cnt", "Counts", "ticks", "inc", "LSB"])
+def test_steps_of_an_encoder_are_a_number_by_whichever_name(unit, tmp_path):
+    assert factor(unit, "") == 1.0 and si_unit(unit) == "" and not same_dimension(unit, "N")
+    (tmp_path / "log.csv").write_text(f"t [s],ENC [{unit}],I [A]\n0,4096,1\n1,4097,2\n2,4098,3\n", encoding="utf-8")
+    assert so.read_log(tmp_path / "log.csv")["ENC"].tolist() == [4096.0, 4097.0, 4098.0]

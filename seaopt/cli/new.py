@@ -15,6 +15,7 @@ from seaopt.cli.progress import show_progress
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import check_regular, describe_os_error, exists, to_json, write_text
+from seaopt.formatting import join_words
 from seaopt.problem import read_problem
 from seaopt.problem.proposal import Proposal, Question, propose
 
@@ -205,6 +206,6 @@ def _print_end(console: Terminal, proposal: Proposal, target: Path) -> None:
     console.say(f"next: seaopt run {shlex.quote(str(target))} -o {out}", soft_wrap=True)
     if proposal.single:
         console.wrap(
-            "then: record the test once more at half the amplitude, and uncomment that log in the file; one amplitude "
-            "alone hides what the model lacks"
+            f"then: record the test of {join_words(proposal.single)} once more at half the amplitude, and uncomment "
+            "that log in the file; one amplitude alone hides what the model lacks"
         )

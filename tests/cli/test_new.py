@@ -98,10 +98,26 @@ def test_as_many_guesses_are_printed_as_the_file_names(folder, seaopt, held):
 def test_several_logs_are_several_experiments(folder, seaopt, held):
     (folder / "second run.csv").write_bytes(held.read_bytes())
     out = seaopt("new", "knee.csv", "second run.csv", "--yes")
-    assert out.returncode == 0 and "once more at half the amplitude" in out.stdout  # both have one
+    says = " ".join(out.stdout.split())
+    assert out.returncode == 0 and "the test of second run.csv once more at half the amplitude" in says  # both have one
     problem = so.read_problem(folder / "problem.toml")
     assert [experiment.name for experiment in problem.table.experiment] == ["knee", "second_run"]
     assert len(problem.experiments()) == 2
+
+
+def test_the_log_of_half_the_amplitude_is_asked_for_where_none_was_given(folder, seaopt, held):
+    """Of the held link both are there; of the link that swings one."""
+    for name, amplitude, locked in (("half", 1.0, True), ("swing", 2.0, False)):
+        t, current = drive(3.0, 400.0, amplitude)
+        log = knee(current, 400.0, locked=locked)
+        columns = {"t [s]": t, "I [A]": log["I"], "tau_s [N m]": log["tau_s"]}
+        columns |= {} if locked else {"theta_l [rad]": log["theta_l"]}
+        write_csv(folder / f"{name}.csv", columns)
+    both = seaopt("new", "knee.csv", "half.csv", "--yes")
+    assert both.returncode == 0 and "once more" not in both.stdout, both.stdout
+    three = seaopt("new", "knee.csv", "half.csv", "swing.csv", "--yes", "--force")
+    says = " ".join(three.stdout.split())
+    assert "record the test of swing.csv once more at half the amplitude" in says, says
 
 
 def test_a_log_that_is_not_there_is_one_line(folder, seaopt):

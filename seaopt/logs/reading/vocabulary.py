@@ -12,7 +12,7 @@ from typing import Literal
 
 from seaopt.errors import SeaoptError
 from seaopt.records import record
-from seaopt.units import bare_name, is_unit, si_unit
+from seaopt.units import COUNT_UNITS, bare_name, is_unit, si_unit
 
 Quantity = Literal["time", "current", "voltage", "duty", "force", "torque", "angle", "length", "speed", "other", ""]
 Side = Literal["motor", "link", "spring", ""]
@@ -69,9 +69,6 @@ UNITS_OF: dict[Quantity, str] = {
     "length": "m",
 }  # fmt: skip
 COUNTS = "counts"
-COUNT_UNITS = frozenset(
-    {"counts", "count", "ticks", "cnt", "inc", "incr", "increments", "ink", "inkr", "inkremente", "lsb", "steps"}
-)
 # Of a unit that is there: what it measures.
 _QUANTITY_OF: dict[str, Quantity] = {
     "s": "time", "A": "current", "V": "voltage", "N": "force", "N m": "torque", "rad": "angle", "m": "length",

@@ -80,7 +80,7 @@ class Proposal:
     """A problem file's text, the roles of the columns, all questions, and the guesses for those without an answer.
 
     `guessed` are the guesses that results rest on, as the file's key of that name has them; `notes` are remarks on what
-    the logs show; `single`: whether a plant's logs have one amplitude, so that the file asks for another.
+    the logs show; `single`: the last log of each plant whose logs have one amplitude: the file asks for another.
     """
 
     text: str
@@ -89,7 +89,7 @@ class Proposal:
     guesses: tuple[Question, ...]
     guessed: tuple[str, ...]
     notes: tuple[str, ...]
-    single: bool
+    single: tuple[str, ...]
 
     @property
     def open(self) -> tuple[Question, ...]:
@@ -151,7 +151,7 @@ def propose(
             *(note for log in described for note in _list_notes(log)),
             *(f"{name_entry(key)}: {doubt}; check its unit" for key, doubt in interview.list_doubts().items()),
         ),
-        single=bool(list_single(described)),
+        single=tuple(log.file for log in list_single(described)),
     )
 
 
