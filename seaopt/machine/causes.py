@@ -41,6 +41,7 @@ SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
 MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
 LESS = 0.1  # of what a single cause leaves: another set of gains, which has more to fit, leaves less
 MOST_CAUSES = 6
+ASKED = "the outer loop's output"
 SHORT = {"gain": "short, gain", "factor": "short, factor", "late": "short, late"}  # more periods would tell these
 ROWS = (
     "terms",
@@ -262,7 +263,7 @@ def _scale(what: str, factor: float, setting: Setting) -> Setting:
     if ticks.rendered is not None and what in ticks.rendered:
         parts = ticks.rendered | {what: factor * ticks.rendered[what]}
         return replace(setting, ticks=replace(ticks, reference=np.sum([*parts.values()], axis=0), rendered=parts))
-    if what == "reference":
+    if what in ("reference", ASKED):
         return replace(setting, ticks=replace(ticks, reference=factor * ticks.reference))
     if what in controller.signals:
         scale = np.ones(ticks.measured.shape[1])
@@ -276,7 +277,7 @@ def _list_factors(setting: Setting) -> Iterator[Alternative]:
     fitted = _fit_factors(setting)
     for what in (
         *(setting.ticks.rendered or ()),
-        "reference",
+        _name_reference(setting.ticks),
         *setting.controller.signals,
         setting.controller.command.input,
     ):
@@ -290,6 +291,11 @@ def _list_factors(setting: Setting) -> Iterator[Alternative]:
                 value=value,
                 change=lambda given, what=what, value=value: _scale(what, value, given),
             )
+
+
+def _name_reference(ticks: Ticks) -> str:
+    """Return what the law's own reference is: the log's, or what an outer loop makes of that."""
+    return "reference" if ticks.rendered is None else ASKED
 
 
 def name_factor(what: str, value: float, signals: Sequence[str]) -> tuple[str, float]:
@@ -312,7 +318,7 @@ def _fit_factors(setting: Setting) -> dict[str, float]:
     if np.count_nonzero(free) < LEAST_HEAD:
         return {}
     nothing = replace(ticks, reference=0.0 * ticks.reference, measured=0.0 * ticks.measured)
-    parts = {"reference": follow(law, replace(nothing, reference=ticks.reference), limited, 0.0)}
+    parts = {_name_reference(ticks): follow(law, replace(nothing, reference=ticks.reference), limited, 0.0)}
     for name, part in (ticks.rendered or {}).items():
         parts[name] = follow(law, replace(nothing, reference=part), limited, 0.0)
     for i, name in enumerate(setting.controller.signals):

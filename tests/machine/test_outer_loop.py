@@ -122,6 +122,13 @@ def test_another_outer_loop_is_named(impedance, changes, what, value):
     assert not row.met and cause.explains and cause.what == what and np.isclose(cause.value, value, rtol=1e-3), row
 
 
+def test_an_outer_loop_whose_whole_output_is_less_is_named_by_that(impedance):
+    result = so.accept(impedance, [make_log(run(impedance, GOAL, stiffness=12.0, damping=0.6))])
+    cause = result.replays[0].causes[0]
+    assert cause.explains and cause.kind == "factor" and np.isclose(cause.value, 0.6, rtol=1e-3), cause
+    assert "the outer loop's output is 0.6 times what it should be" in " ".join(str(result).split())
+
+
 def test_without_the_links_position_it_says_what_to_log(impedance):
     with pytest.raises(so.SeaoptError, match="log in each tick tau_s and theta_l"):
         so.accept(impedance, [make_log(run(impedance, GOAL[:500]), position=False)])
