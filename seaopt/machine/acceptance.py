@@ -25,10 +25,10 @@ from seaopt.machine.differences.rate_of_commands import find_rate
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
+from seaopt.machine.response.tripped import find_refused, find_trip
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand
 from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference_unit, take_ticks
-from seaopt.machine.tripped import find_refused, find_trip
 from seaopt.parameters import ParameterSet
 from seaopt.records import Result, Worded, record
 from seaopt.robustness import check_ranges

@@ -17,10 +17,10 @@ from seaopt.machine.causes import Cause, find_causes, leave_open
 from seaopt.machine.decimated import SAME_RATE, LineMatch, count_ticks_per_row, match_lines
 from seaopt.machine.hidden import find_hidden
 from seaopt.machine.open_loop import find_unfollowed
+from seaopt.machine.response.tripped import Trip
 from seaopt.machine.stepped import FLOOR, Match, Others, Setting, Source, make_setting, play
 from seaopt.machine.stopped import find_stop
 from seaopt.machine.ticks import Ticks, find_saturated
-from seaopt.machine.tripped import Trip
 from seaopt.records import record
 
 SIGMAS = 4.0  # of what rounding allows

@@ -11,7 +11,7 @@ from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.free_gains import SAME_GAINS
 from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band
-from seaopt.machine.tripped import Trip
+from seaopt.machine.response.tripped import Trip
 from seaopt.units import unit_after
 
 EVERY_TICK = "of a log with every n-th tick"
