@@ -81,7 +81,7 @@ class Segments:
         floor = power * (ticks.quantum**2 + (FLOOR**2 * float(np.std(ticks.command))) ** 2)
         variance = floor + np.sum(power * steps[:, None] ** 2 * np.abs(responses) ** 2, axis=0)
         empty = cls(
-            off=np.zeros((0, 0), dtype=complex),
+            off=np.zeros((0, f.size), dtype=complex),
             f=f,
             std=np.sqrt(variance),
             responses=responses,
