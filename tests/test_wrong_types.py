@@ -98,6 +98,7 @@ CASES = {
     "experiments as text": lambda: so.fit("ab", THOR),
     "experiments of text": lambda: so.fit(["ab"], THOR),
     "no experiments": lambda: so.fit(None, THOR),
+    "start that is no fit": lambda: so.fit([experiment(log=LONG)], THOR, start=THOR),
     "experiment of a plant without states": lambda: so.fit([experiment(plant=STILL)], so.ParameterSet()),
     "tuned plant": lambda: so.tune(None, THOR, SPEC),
     "tuned spec": lambda: so.tune(PLANT, THOR, None),

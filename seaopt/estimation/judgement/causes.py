@@ -20,7 +20,14 @@ from seaopt.estimation.judgement.score_test import ScoreTest
 from seaopt.estimation.judgement.second_log import FAR
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_experiment import measure_spread
-from seaopt.estimation.problem.fit_problem import BudgetError, Evaluation, FitProblem, pose_problem
+from seaopt.estimation.problem.fit_problem import (
+    BudgetError,
+    Evaluation,
+    FitProblem,
+    count_left,
+    limit_evaluations,
+    pose_problem,
+)
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
@@ -50,6 +57,7 @@ MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation move
 HOPELESS, PATIENCE = 1.4, 8  # a misfit that is larger by so much of the samples, after so many iterations, stays so
 STILL, SLIGHT = 5, 0.1  # iterations in a row that gain so little of misfit end a refit: where a delay's slope has kinks
 SURE = 2.5  # standard deviations by which one of two is nearer to held-out samples
+COMPARES = 8  # evaluations that are kept for that: two fits near their minima take four
 PROMISES = 0.5  # of a gain that counts: what shows with coarse steps, the same in fit and refit, before finer are made
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
 
@@ -115,12 +123,14 @@ def find_causes(
         if spent >= 1.0:
             break
         progress(f"trying cause {number} of {len(candidates)}", max(spent, (number - 1) / len(candidates)))
+        kept = COMPARES if all(_find_rivals(fit, causes)) else 0
         try:
-            solved = _refit(minimum, candidate, coarse, measure_misfit(fitted) + HOPELESS * fit.samples)
-            if solved is None or not _promises(fit, candidate, coarse, rough, solved, colour):
-                continue
-            before = _measure_kept(fit, minimum.problem, minimum.z, candidate.kept) if candidate.kept else whole
-            solved = refine_to(solved, minimum.problem)
+            with limit_evaluations(count_left() - kept):
+                solved = _refit(minimum, candidate, coarse, measure_misfit(fitted) + HOPELESS * fit.samples)
+                if solved is None or not _promises(fit, candidate, coarse, rough, solved, colour):
+                    continue
+                before = _measure_kept(fit, minimum.problem, minimum.z, candidate.kept) if candidate.kept else whole
+                solved = refine_to(solved, minimum.problem)
         except BudgetError:
             break
         except SeaoptError:  # what does not make a problem explains nothing
@@ -141,9 +151,7 @@ def _drop_worse(fit: Fit, causes: list[Cause]) -> list[Cause]:
     """Return the causes, the best first, with the better over held-out samples of channels that are late and the
     spring's damper; both where chance alone sets them apart, or neither is the best.
     """
-    dampers = {e.plant.spring.damper for e in fit.experiments if e.plant.spring is not None}
-    late = next((cause for cause in causes if cause.apart), None)
-    damped = next((cause for cause in causes if dampers & cause.preferred.keys()), None)
+    late, damped = _find_rivals(fit, causes)
     if late is None or damped is None or causes[0] not in (late, damped):
         return causes
     try:
@@ -152,6 +160,13 @@ def _drop_worse(fit: Fit, causes: list[Cause]) -> list[Cause]:
         return causes
     worse = late if nearer > SURE else damped if nearer < -SURE else None
     return [cause for cause in causes if cause is not worse]
+
+
+def _find_rivals(fit: Fit, causes: Sequence[Cause]) -> tuple[Cause | None, Cause | None]:
+    """Return the first cause of channels that are late, and of the spring's damper; None where there is none."""
+    dampers = {e.plant.spring.damper for e in fit.experiments if e.plant.spring is not None}
+    late = next((cause for cause in causes if cause.apart), None)
+    return late, next((cause for cause in causes if dampers & cause.preferred.keys()), None)
 
 
 def _measure_powers(evaluation: Evaluation, problem: FitProblem) -> Float[np.ndarray, "outputs 2"]:

@@ -328,7 +328,8 @@ def _judge_rest(run: _Run, drawn: ParameterSet, judge: Judge) -> None:
         return
     takes = abs(float(rest.current_A[run.index]))
     where = format_values({name: drawn[name].value for name in run.stage.plant.states if name in drawn}, missing="")
-    text = f"to rest at {where} takes {command.show(takes)}, above the limit of {command.show(limit)}"
+    taken = command.show(float(rest.current_A[run.index]))
+    text = f"to rest at {where} takes {taken}, above the limit of {command.show(limit)}"
     judge.require("rest", takes, limit * (1.0 + ABOVE_LIMIT), text, command.unit, remedy="narrow its range")
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 import seaopt as so
-from seaopt.errors import EstimationError
 from seaopt.estimation.problem.fit_problem import count_evaluations
 from tests.actuator_logs import KNEE, SCREW, drive, knee, screw
 
@@ -82,9 +81,3 @@ def test_an_earlier_fit_that_explains_little_is_left():
     assert again.status == afresh.status == "converged"
     for name in afresh.covariance.names:
         assert again.parameters[name].value == pytest.approx(afresh.parameters[name].value, rel=1e-3)
-
-
-def test_what_is_no_fit_is_refused():
-    experiment, params = pose_screw(1)
-    with pytest.raises(EstimationError, match="start"):
-        so.fit([experiment], params, start=params)
