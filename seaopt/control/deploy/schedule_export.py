@@ -42,14 +42,7 @@ def read_runnable(
     first = controllers[0]
     if not all(is_alike(each.compensation, first.compensation) for each in controllers):
         raise FileError("controller.json: terms are not alike at all points; tune again")
-    schedule = ScheduledController(
-        over=table.over,
-        unit=table.unit,
-        points=table.points,
-        controllers=tuple(controllers),
-        others={},
-        fallback=table.fallback,
-    )
+    schedule = ScheduledController.of_points(table, controllers)
     law = schedule.runnable(limit=limit, tracking_time_s=tracking_time_s)
     if tracking_time_s is None and not np.allclose(law.anti_windup, table.anti_windup, rtol=AGREES, atol=0.0):
         raise FileError("controller.json: schedule.anti_windup is not what the gains give; tune again")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,6 +34,9 @@ from seaopt.formatting import format_count, join_words
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import Result, Worded, record
+
+if TYPE_CHECKING:
+    from seaopt.control.scheduling.stored import StoredPoints
 
 PARTS = 4  # of every stretch between two points, at whose ends the limits are judged
 LEAST_BANDWIDTH = 0.9  # of the one asked, that the law has between the points
@@ -302,13 +305,25 @@ class ScheduledController(Result, Worded):
         from seaopt.control.scheduling.stored import read_points  # deferred: pydantic
 
         table, _, controllers = read_points(content)
+        return cls.of_points(table, controllers)
+
+    @classmethod
+    def of_points(
+        cls,
+        table: StoredPoints,
+        controllers: Iterable[Controller],
+        others: Plants | None = None,
+        draws: Draws = (),
+    ) -> ScheduledController:
+        """Return the schedule of a file's table with the controllers at its points."""
         return cls(
             over=table.over,
             unit=table.unit,
             points=table.points,
             controllers=tuple(controllers),
-            others={},
+            others=others or {},
             fallback=table.fallback,
+            draws=draws,
         )
 
     @classmethod
@@ -326,18 +341,11 @@ class ScheduledController(Result, Worded):
         from seaopt.control.scheduling.stored import read_points  # deferred: pydantic
 
         table, contents, _ = read_points(content)
-        return cls(
-            over=table.over,
-            unit=table.unit,
-            points=table.points,
-            controllers=tuple(
-                Controller.from_dict(tuned, plant, place_variable(plant, params, table.over, point))
-                for point, tuned in zip(table.points, contents, strict=True)
-            ),
-            others=others or {},
-            fallback=table.fallback,
-            draws=draws,
-        ).with_places()
+        controllers = (
+            Controller.from_dict(tuned, plant, place_variable(plant, params, table.over, point))
+            for point, tuned in zip(table.points, contents, strict=True)
+        )
+        return cls.of_points(table, controllers, others, draws).with_places()
 
 
 @lru_cache(maxsize=8)
