@@ -112,12 +112,13 @@ def explain(
     tried = sorted((each for each in tried if each.left < before), key=lambda each: each.rank)
     if not tried:
         return []
-    limit, told = _try_limit(case, tried)
+    limited = take_limited(comparison, logs) if _may_be_limited(case, tried) else None
+    limit, told = (None, False) if limited is None else _try_limit(case, tried, limited)
     if limit is not None:
         tried = [limit, *tried] if told else sorted((*tried, limit), key=lambda each: each.rank)
     kinds = _group(tried, noise)
     if tried[0].left > WORTH * noise:
-        least, starts = min(each.left for each in tried), _list_starts(case, kinds, limit)
+        least, starts = min(each.left for each in tried), _list_starts(case, kinds, limit, limited)
         pairs = find_pairs(starts, _list_knobs(case), values, spread, (least, noise))
         kinds = [*([pair] for pair in pairs), *kinds]
     return _list_found(case, kinds, told=told)
@@ -160,20 +161,22 @@ def _list_found(case: Case, kinds: Sequence[list[Tried]], *, told: bool) -> list
     return found
 
 
-def _try_limit(case: Case, tried: Sequence[Tried]) -> tuple[Tried | None, bool]:
-    """Return a limit of the drive where a smaller gain explains much, or nothing explains all, and the log does not
-    exclude the limit; and whether what lies between the lines tells it from the best of what was tried, which leaves no
-    less than it.
-    """
+def _may_be_limited(case: Case, tried: Sequence[Tried]) -> bool:
+    """Tell whether to try a limit of the drive: where a smaller gain explains much, or nothing explains all."""
     smaller = any(
         each.difference.kind == "gain" and 0.0 < each.difference.value < 1.0 and each.left <= HALF * case.before
         for each in tried
     )
     period = case.comparison.controller.sample_time_s
     every_tick = all(ticks.rate_hz * period > EVERY for ticks in case.logs)
-    if not every_tick or (not smaller and tried[0].left <= WORTH * case.noise):
-        return None, False
-    limited, best = take_limited(case.comparison, case.logs), tried[0]
+    return every_tick and (smaller or tried[0].left > WORTH * case.noise)
+
+
+def _try_limit(case: Case, tried: Sequence[Tried], limited: Comparison) -> tuple[Tried | None, bool]:
+    """Return a limit of the drive where the log does not exclude it; and whether what lies between the lines tells it
+    from the best of what was tried, which leaves no less than it. `limited`: the comparison whose model has one.
+    """
+    best = tried[0]
     limit = try_limit(limited, case.values, case.spread)
     if limit is None or limit.values is None or limit.left > RIVAL * max(best.left, case.noise):
         return None, False
@@ -197,8 +200,10 @@ def _list_knobs(case: Case) -> list[Knob]:
     return [*parameters, make_delay(case.comparison.controller.sample_time_s)]
 
 
-def _list_starts(case: Case, kinds: Sequence[Sequence[Tried]], limit: Tried | None) -> list[Start]:
-    """Return the best of each kind of causes that a second can be tried beside."""
+def _list_starts(
+    case: Case, kinds: Sequence[Sequence[Tried]], limit: Tried | None, limited: Comparison | None
+) -> list[Start]:
+    """Return the best of each kind of causes that a second can be tried beside. `limited`: the model of `limit`."""
     starts, knobs = list[Start](), {knob.parameter.name: knob for knob in _list_knobs(case)}
     period = case.comparison.controller.sample_time_s
     for kind in kinds:
@@ -209,8 +214,7 @@ def _list_starts(case: Case, kinds: Sequence[Sequence[Tried]], limit: Tried | No
             elif what.kind == "delay":
                 knob = make_delay(period)
                 start = knob, max(value / period, 0.0), case.comparison
-            elif each is limit:
-                limited = take_limited(case.comparison, case.logs)
+            elif each is limit and limited is not None:
                 start = make_knob(limited, value), 0.0, limited
             else:
                 continue
