@@ -73,9 +73,11 @@ class ClosesLoops(LoopDelays):
         """Return a plant with every signal that is read."""
         return plant
 
-    def plant(self, plant: Plant, params: ParameterSet) -> DigitalPlant:
-        """Return a plant as this controller sees it: from effort, through its own command per effort."""
-        timing, gain = (self.sample_time_s, self.compute_delay_samples), self.per_effort
+    def plant(self, plant: Plant, params: ParameterSet, *, rate: float = 1.0) -> DigitalPlant:
+        """Return a plant as this controller sees it: from effort, through its own command per effort. `rate`: at which
+        it is stepped, over its own.
+        """
+        timing, gain = (self.sample_time_s / rate, self.compute_delay_samples), self.per_effort
         return sample(self.see(plant), self.delay(params), self.signals, gain, *timing)
 
     def close(self, plant: Plant, params: ParameterSet) -> Loop:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control import Controller, sample
+from seaopt.control import Controller
 from seaopt.errors import SeaoptError
 from seaopt.machine.differences.explanations import USUAL_RATES
 from seaopt.machine.differences.size_fit import Difference
@@ -53,12 +53,8 @@ def measure_left(controller: Controller, ticks: Ticks, rate: float) -> float:
 
     assert controller.design is not None
     plant, values = controller.design
-    seen, timing = controller.see(take_sliding(plant, values)), controller.sample_time_s / rate
     try:
-        model = sample(
-            seen, controller.delay(values), controller.signals, controller.per_effort, timing,
-            controller.compute_delay_samples,
-        )  # fmt: skip
+        model = controller.plant(take_sliding(plant, values), values, rate=rate)
     except SeaoptError:
         return np.inf
     rows = min(ROWS, len(ticks))
