@@ -25,7 +25,7 @@ from seaopt.machine.differences.rate_of_commands import find_rate
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
-from seaopt.machine.response.tripped import find_refused, find_trip
+from seaopt.machine.response.tripped import Trip, find_refused, find_trip
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand
 from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference_unit, take_ticks
@@ -252,7 +252,7 @@ def accept(
     sources = tuple(log.source for log in logs)
     experiments = tuple(
         replace(make_experiment(law, ticks, row.command_late), law=_hash(controller))
-        for ticks, row in zip((_end_at_trip(law, ticks) for ticks in rows), replays, strict=True)
+        for ticks, row in zip(map(_end_at_trip, rows, (row.trip for row in replays)), replays, strict=True)
         if row.met and _shows_machine(ticks, row)
     )
     result = Acceptance(
@@ -267,9 +267,10 @@ def accept(
         told = any(not row.met and not row.undecided for row in replays)
         return replace(result, left_out={"response": OTHER_LAW if told else UNTOLD_LAW})
     rows = [
-        _end_at_trip(law, _take_whole(controller, log, ticks, row, reference, at)) if row.ticks_per_row == 1 else ticks
+        _take_whole(controller, log, ticks, row, reference, at) if row.ticks_per_row == 1 else ticks
         for log, ticks, row in zip(logs, rows, replays, strict=True)
     ]
+    rows = [_end_at_trip(ticks, find_trip(law, ticks)) for ticks in rows]
     blocks, left_out = list[Blocks](), dict[str, str]()
     for ticks, row in zip(rows, replays, strict=True):
         try:
@@ -317,9 +318,8 @@ def _shows_machine(ticks: Ticks, row: Replay) -> bool:
     return row.ticks_per_row == 1 and ticks.rendered is None and len(ticks) >= FEWEST
 
 
-def _end_at_trip(law: Controller, ticks: Ticks) -> Ticks:
+def _end_at_trip(ticks: Ticks, trip: Trip | None) -> Ticks:
     """Return the ticks before the readings of which the law's gate made a fault."""
-    trip = find_trip(law, ticks)
     return ticks if trip is None else ticks.take(slice(0, trip.row))
 
 
