@@ -24,13 +24,14 @@ from seaopt.machine.stepped import (
     Others,
     Setting,
     count_head,
+    find_at_limit,
     find_limited,
     find_modes,
     follow,
     limit_law,
     play,
 )
-from seaopt.machine.ticks import AT_LIMIT, Ticks
+from seaopt.machine.ticks import Ticks
 from seaopt.records import record
 
 LEAST_HEAD = 60  # rows within the limit that factors take
@@ -97,7 +98,7 @@ class Alternative:
 
 def find_causes(whole: Setting, match: Match, others: Others) -> tuple[tuple[Cause, ...], Setting]:
     """Return the causes that explain a mismatch, the best first, and the setting as the first (and a second) has it."""
-    limited = find_limited(whole.ticks) | (np.abs(whole.ticks.command) >= AT_LIMIT * whole.linear.command_limit)
+    limited = find_at_limit(whole.ticks, whole.linear)
     size = max(WINDOW, count_head(whole.linear))  # about the largest mismatch but where all laws are alike
     middle = int(np.argmax(np.abs(match.error) * (~limited if np.any(~limited) else 1.0)))
     begin = max(0, min(middle - size // 2, len(whole.ticks) - size))

@@ -24,8 +24,9 @@ from jaxtyping import Float
 from seaopt.control import Controller, RunnableLaw, runnable
 from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.errors import SeaoptError
-from seaopt.machine.stepped import FLOOR, Others, Setting, drive_law, find_limited, list_powers
-from seaopt.machine.ticks import AT_LIMIT, Ticks
+from seaopt.logs.quality.faults import find_runs
+from seaopt.machine.stepped import FLOOR, Others, Setting, drive_law, find_at_limit, list_powers
+from seaopt.machine.ticks import Ticks
 from seaopt.records import record
 
 FEWEST, MOST = 400, 4000  # rows without a limit that it takes in all
@@ -175,14 +176,12 @@ def _find_free(setting: Setting) -> list[Ticks]:
     few.
     """
     ticks = setting.ticks
-    limited = find_limited(ticks) | (np.abs(ticks.command) >= AT_LIMIT * setting.linear.command_limit)
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], limited, [True]]).astype(int))).reshape(-1, 2)
-    edges = edges[np.argsort(edges[:, 0] - edges[:, 1], kind="stable")][:RUNS]
+    runs = find_runs(~find_at_limit(ticks, setting.linear))
     found, left = list[Ticks](), MOST
-    for start, stop in edges:
-        rows = min(int(stop - start), left)
+    for k in np.argsort(-runs.lengths, kind="stable")[:RUNS]:
+        stop, rows = int(runs.stop[k]), min(int(runs.lengths[k]), left)
         if rows >= max(SHORTEST, PER_STATE * setting.linear.c.size):
-            found.append(ticks.take(slice(int(stop) - rows, int(stop))))
+            found.append(ticks.take(slice(stop - rows, stop)))
             left -= rows
     return found if MOST - left >= FEWEST else []
 

@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.logs.quality.faults import find_quantisation
-from seaopt.machine.stepped import Match, Setting, find_limited, find_modes
-from seaopt.machine.ticks import AT_LIMIT
+from seaopt.machine.stepped import Match, Setting, find_at_limit, find_modes
 from seaopt.records import record
 
 ROWS = 32  # p
@@ -47,7 +46,7 @@ def find_unfollowed(setting: Setting, match: Match) -> tuple[str, ...]:
     `match`: of the law's replay.
     """
     ticks, law = setting.ticks, setting.linear
-    limited = find_limited(ticks) | (np.abs(ticks.command) >= AT_LIMIT * law.command_limit)
+    limited = find_at_limit(ticks, law)
     if np.sqrt(match.energy) < OFF * np.std(ticks.command) or not np.ptp(ticks.command):
         return ()
     found = list[str]()

@@ -288,6 +288,11 @@ def find_limited(ticks: Ticks) -> Bool[np.ndarray, " n"]:
     return top if np.any(top[1:] & top[:-1]) else np.zeros(size.size, dtype=bool)
 
 
+def find_at_limit(ticks: Ticks, law: RunnableLaw) -> Bool[np.ndarray, " n"]:
+    """Tell which logged commands are at a limit: at the law's own single rows, too."""
+    return find_limited(ticks) | (np.abs(ticks.command) >= AT_LIMIT * law.command_limit)
+
+
 def find_modes(law: RunnableLaw, limited: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n m"]:
     """Return what each state at the first row adds to the later commands, with the limit as logged."""
     rows, moved = np.empty((limited.size, law.c.size)), np.eye(law.c.size)
@@ -327,7 +332,7 @@ def follow(
 
 def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
     """Return a state from which the first rows match as well as they can."""
-    limited = find_limited(ticks) | (np.abs(ticks.command) >= AT_LIMIT * law.command_limit)  # single rows, too
+    limited = find_at_limit(ticks, law)
     if np.count_nonzero(~limited) < 3 * max(law.c.size, 1) or not law.c.size:
         return np.zeros(law.c.size)
     left, weight = ticks.command - follow(law, ticks, limited), 1.0 / allowed[~limited]

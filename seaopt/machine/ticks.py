@@ -15,7 +15,7 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import LogError
 from seaopt.formatting import join_words
 from seaopt.logs import Log
-from seaopt.logs.quality.faults import find_quantisation, find_rails, measure_stillness
+from seaopt.logs.quality.faults import find_quantisation, find_rails, find_runs, measure_stillness
 from seaopt.records import record
 from seaopt.signals import REFERENCES
 
@@ -66,8 +66,9 @@ class Ticks:
 
     def split(self) -> list[Ticks]:
         """Return the stretches that have all numbers, but for those that are too short for a replay."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], self.complete, [False]]).astype(int)))
-        return [self.take(slice(start, stop)) for start, stop in edges.reshape(-1, 2) if stop - start >= FEWEST]
+        runs = find_runs(self.complete)
+        runs = runs.where(runs.lengths >= FEWEST)
+        return [self.take(slice(start, stop)) for start, stop in zip(runs.start, runs.stop, strict=True)]
 
     def take(self, rows: Any, *, command: slice | None = None, measured: slice | None = None) -> Ticks:
         """Return some rows, a slice or numbers; with the command, or the readings, of other rows."""
@@ -251,8 +252,8 @@ def _find_longest(log: Log, whole: Any) -> slice:
     """Return the longest run of rows that are whole, within one segment of the log."""
     best = slice(0, 0)
     for segment in log.segments:
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], whole[segment], [False]]).astype(int)))
-        for start, stop in edges.reshape(-1, 2):
+        runs = find_runs(whole[segment])
+        for start, stop in zip(runs.start, runs.stop, strict=True):
             if stop - start > best.stop - best.start:
                 best = slice(segment.start + int(start), segment.start + int(stop))
     return best

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from seaopt.control import Controller
 from seaopt.errors import LogError
 from seaopt.formatting import format_count, join_words
+from seaopt.logs.quality.faults import find_runs
 from seaopt.machine.response.runaway import say_runaway
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
@@ -139,8 +140,9 @@ def _span(reference: Float[np.ndarray, " n"]) -> float:
 def _find_short(missing: Bool[np.ndarray, " n"], most: int) -> Bool[np.ndarray, " n"]:
     """Tell which of the missing rows are in gaps of no more than so many rows."""
     short = np.zeros(missing.size, dtype=bool)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], missing, [False]]).astype(int))).reshape(-1, 2)
-    for start, stop in edges[np.diff(edges, axis=1)[:, 0] <= most].tolist():
+    gaps = find_runs(missing)
+    gaps = gaps.where(gaps.lengths <= most)
+    for start, stop in zip(gaps.start, gaps.stop, strict=True):
         short[start:stop] = True
     return short
 

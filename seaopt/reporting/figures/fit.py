@@ -9,6 +9,7 @@ import numpy as np
 from seaopt import welch
 from seaopt.errors import EstimationError
 from seaopt.estimation import Diagnostics, Fit, ModelledOutputs
+from seaopt.logs.quality.faults import find_runs
 from seaopt.reporting.figures.panel import BAND, BLUE, COLOURS, LIMIT, MEASURED, Panel, draw_level, frequency_panel
 from seaopt.reporting.figures.thinning import describe_thinning, thin_series
 from seaopt.signals import VectorM, VectorN
@@ -144,12 +145,11 @@ def amplitude_density(values: VectorN, period: float) -> tuple[VectorM, VectorM]
 
 def _find_longest_run(values: VectorN) -> VectorM:
     """Return the longest run of finite samples."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isfinite(values).astype(int), [0]])))
-    runs = edges.reshape(-1, 2)
-    if not runs.size:
+    runs = find_runs(np.isfinite(values))
+    if not len(runs):
         return values[:0]
-    first, last = runs[int(np.argmax(runs[:, 1] - runs[:, 0]))]
-    return values[first:last]
+    longest = int(np.argmax(runs.lengths))
+    return values[runs.start[longest] : runs.stop[longest]]
 
 
 def autocorrelation_panel(diagnostics: Diagnostics, experiment: str) -> Panel:

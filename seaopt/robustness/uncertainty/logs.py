@@ -39,6 +39,7 @@ from seaopt.formatting import join_words
 from seaopt.frequency.residual import LENGTHS, ResidualResponse, find_feedback, measure_residual
 from seaopt.frequency.response import ComplexLines, Lines, find_band
 from seaopt.frequency.sampled import sampled_response
+from seaopt.logs.quality.faults import find_runs
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import has_friction
 from seaopt.records import record
@@ -108,8 +109,8 @@ class _Record:
         for rows in self.experiment.log_segments:
             joined[rows] = True
             joined[rows.start] = False  # no run goes over a gap
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], (good & joined).astype(int), [0]]))).reshape(-1, 2)
-        return [slice(a, b) for a, b in edges.tolist()]
+        runs = find_runs(good & joined)
+        return [*map(slice, runs.start.tolist(), runs.stop.tolist())]
 
 
 def judge_log(
