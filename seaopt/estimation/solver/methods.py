@@ -21,6 +21,7 @@ from seaopt.estimation.solver.loosening import loosen_start
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
 from seaopt.estimation.solver.settle import Solved, explains_little, settle, settle_roughly
 from seaopt.estimation.solver.shots import cut_problem, find_start_on_shots, grow_shots
+from seaopt.estimation.solver.starts_around import search_around
 from seaopt.records import record
 
 FAR = 10.0  # times its start: a parameter whose standard deviation is larger than itself there has lost its effect
@@ -84,16 +85,15 @@ class OutputError(Method):
         if not self.search:
             return solved
         solved = _bring_back(solved, self, callback)
-        if not problem.seeks_play and not _is_doubtful(solved, guesses):
-            return solved
-        for start in _further_starts(problem, best, guesses, self):
+        doubtful = problem.seeks_play or _is_doubtful(solved, guesses)
+        for start in _further_starts(problem, best, guesses, self) if doubtful else ():
             evaluation = problem.evaluate(start)
             if not _is_hopeless(problem, evaluation, solved):
                 other = settle(problem, evaluation, self.max_iterations, name_phase(callback, "another start"))
                 solved = min(solved, other, key=lambda each: each.misfit)
                 if not _is_doubtful(solved, guesses):
                     break
-        return solved
+        return search_around(solved, self.seed, self.max_iterations, callback)
 
 
 @record

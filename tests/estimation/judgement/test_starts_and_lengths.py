@@ -139,6 +139,16 @@ def test_a_servo_whose_hold_is_given_has_its_elasticity():
     assert {finding.where for finding in fit.errors} == {"b_r"}  # known to 40 %
 
 
+@pytest.mark.parametrize(("seed", "late_s"), [(0, 0.0), (5, 0.0), (7, 0.0), (1, 0.005), (4, 0.005)])
+def test_starts_a_factor_of_three_off_come_to_the_elastic_joint(seed, late_s):
+    """Once: a link of 194 times the inertia on a spring of an eighth, whose residual is three times a tick's."""
+    start = draw_start(SERVO, seed, 3.0)
+    fit = fit_servo(start, 8.0, parts=["servo_hold"], late_s=late_s, free=["T_h"], diagnostics=False, T_h=HOLD_S)
+    for name in ("J_m", "J_l", "k_s", "c_s", "f_c"):
+        assert fit.parameters[name].value == pytest.approx(SERVO[name], rel=0.06), name
+    assert fit.status == "converged"
+
+
 @pytest.mark.parametrize("late_s", [0.005, 0.01])
 def test_a_delay_that_begins_samples_off_starts_where_the_log_has_it(late_s):
     """Once: a spring of an eighth, and firmware that held for seven milliseconds, in place of a delay of none."""

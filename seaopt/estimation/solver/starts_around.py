@@ -1,0 +1,66 @@
+"""A search that has strayed: it ended far from the given values, and what it leaves is no noise.
+
+A position servo whose start is a factor of three off may end where a heavy link on a soft, damped spring makes up for
+an elastic joint: inertia and damping grow together along a valley, hundreds of times over, and no frequency response
+shows another start, for the duty is at its limit in half of the log. The given values are within a factor of ten of the
+truth, so that a minimum further away from which the residual is not the sensors' noise is in doubt. Starts around the
+given values, each a factor of two up or down and the next with all ways turned, are settled roughly, until one leaves
+noise; the best goes on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.estimation.problem.noise_floor import measure_excess
+from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.solver.least_squares import Callback, name_phase
+from seaopt.estimation.solver.settle import Solved, settle, settle_roughly
+
+FAR = 10.0  # times its given value, from which one has strayed
+NOISE = 1.5  # times a sensor's own, that a residual is at most where nothing is wrong
+OFF, STARTS = 2.0, 12  # times the given values, and how many starts
+
+
+def search_around(solved: Solved, seed: int, max_iterations: int, callback: Callback | None) -> Solved:
+    """Return the better of a minimum that has strayed and the best of those around the given values; the minimum itself
+    where it has not, and of linear plants, whose starts are their frequency responses.
+    """
+    problem, z = solved.problem, solved.solution.z
+    unknowns, count = problem.unknowns, problem.unknowns.shared
+    if problem.all_linear or not _has_strayed(solved) or _leaves_noise(solved):
+        return solved
+    callback, rng, best = name_phase(callback, "another start"), np.random.default_rng(seed), solved
+    ways = np.ones(count)
+    for number in range(STARTS):
+        ways = -ways if number % 2 else rng.choice([-1.0, 1.0], count)
+        start = z.copy()
+        start[:count] = unknowns.start[:count] * OFF**ways
+        rough = settle_roughly(problem, problem.evaluate(np.clip(start, unknowns.low, unknowns.high)), callback)
+        best = min(best, rough, key=lambda each: each.misfit)
+        if best is rough and _leaves_noise(rough):
+            break
+    if best is solved:
+        return solved
+    # With steps of its own: those of a minimum that explains little are too coarse.
+    other = settle(problem, problem.evaluate(best.solution.z), max_iterations, callback)
+    iterations = solved.solution.iterations + other.solution.iterations
+    other = replace(other, solution=replace(other.solution, iterations=iterations))
+    return min(solved, other, key=lambda each: each.misfit)
+
+
+def _has_strayed(solved: Solved) -> bool:
+    """Tell whether a value ended far above the given one, or far below and yet told from none."""
+    evaluation, unknowns = solved.solution.evaluation, solved.problem.unknowns
+    if not np.isfinite(evaluation.cost) or not np.all(np.isfinite(evaluation.hessian)):
+        return False
+    start, z = np.abs(unknowns.start[: unknowns.shared]), np.abs(solved.solution.z[: unknowns.shared])
+    variances = np.diag(invert(evaluation.hessian)[0])[: unknowns.shared]
+    far = (z > FAR * start) | ((z < start / FAR) & (variances < z**2))
+    return bool(np.any(far & (start > 0.0)))
+
+
+def _leaves_noise(solved: Solved) -> bool:
+    return all(excess <= NOISE for excess in measure_excess(solved.problem, solved.solution.z).values())
