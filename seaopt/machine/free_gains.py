@@ -25,7 +25,7 @@ from seaopt.control import Controller, RunnableLaw, runnable
 from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.errors import SeaoptError
 from seaopt.logs.quality.faults import find_runs
-from seaopt.machine.stepped import FLOOR, Others, Setting, drive_law, find_at_limit, list_powers
+from seaopt.machine.stepped import FLOOR, Inputs, Others, Setting, find_at_limit
 from seaopt.machine.ticks import Ticks
 from seaopt.records import record
 
@@ -46,13 +46,15 @@ def read_gains(controller: Controller) -> Gains | None:
     return Gains.from_names(controller.gains, controller.observer, controller.speed_loop, controller.link)
 
 
-def make_law(controller: Controller, gains: Gains, sample_time_s: float | None = None) -> Callable[[Setting], Setting]:
+def make_law(
+    controller: Controller, gains: Gains, sample_time_s: float | None = None, *, balanced: bool = True
+) -> Callable[[Setting], Setting]:
     """Return what gives a setting the law of other gains, or of another sample time, with the guards that it has."""
 
     def change(setting: Setting) -> Setting:
         period = sample_time_s or controller.sample_time_s
-        law = gains.law(controller.spec.structure, period).balanced()
-        made = runnable(replace(controller, law=law))
+        law = gains.law(controller.spec.structure, period)
+        made = runnable(replace(controller, law=law.balanced() if balanced else law))
         guards: dict[str, Any] = {
             name: getattr(setting.linear, name) for name in ("gate", "heat", "compensation", "command_limit")
         }
@@ -100,14 +102,15 @@ def fit_gains(setting: Setting) -> Gains | None:
     """
     from scipy.optimize import least_squares  # deferred: 0.1 s
 
-    own, stretches = read_gains(setting.controller), _find_free(setting)
-    if own is None or not isinstance(setting.law, RunnableLaw) or not stretches:
+    own, rows = read_gains(setting.controller), _find_free(setting)
+    if own is None or not isinstance(setting.law, RunnableLaw) or not rows:
         return None
+    runs = [_Run(commands=ticks.command, inputs=Inputs.make(setting.linear, ticks)) for ticks in rows]
     numbers, scale = _Numbers(gains=own), float(np.std(setting.ticks.command))
     names, first = list(numbers.times), np.log(list(numbers.times.values()))
 
     def solve(z: Float[np.ndarray, " t"]) -> tuple[Gains, Float[np.ndarray, " n"]]:
-        return _project(setting, stretches, numbers, dict(zip(names, np.exp(z).tolist(), strict=True)))
+        return _project(setting, runs, numbers, dict(zip(names, np.exp(z).tolist(), strict=True)))
 
     best: tuple[float, Gains] | None = None
     for factor in STARTS:
@@ -126,49 +129,38 @@ def fit_gains(setting: Setting) -> Gains | None:
     return None if best is None else best[1]
 
 
+@record(eq=False)
+class _Run:
+    """A run of rows without a limit."""
+
+    commands: Float[np.ndarray, " n"]
+    inputs: Inputs
+
+    def leave_states(self, laws: Sequence[RunnableLaw]) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+        """Return what each of the laws makes more than the first, and the logged commands less those of the first,
+        from zero, both without what a state at the first row adds.
+        """
+        first, *others = (self.inputs.respond(law) for law in laws)
+        basis = np.linalg.qr(first[1] / np.maximum(np.linalg.norm(first[1], axis=0), np.finfo(float).tiny))[0]
+        columns = np.column_stack([*(out - first[0] for out, _ in others), self.commands - first[0]])
+        columns -= basis @ (basis.T @ columns)
+        return columns[:, :-1], columns[:, -1]
+
+
 def _project(
-    setting: Setting, stretches: Sequence[Ticks], numbers: _Numbers, times: Mapping[str, float]
+    setting: Setting, runs: Sequence[_Run], numbers: _Numbers, times: Mapping[str, float]
 ) -> tuple[Gains, Float[np.ndarray, " n"]]:
-    """Return the best gains at given time constants, and what they and the best states at the start of each stretch
-    leave of the commands.
+    """Return the best gains at given time constants, and what they and the best states at the start of each run leave
+    of the commands.
     """
     own = numbers.linear
     # Where each gain is half as large again, of which the commands change by half of its column.
     points = [own, *(own + 0.5 * step for step in np.diag(own))]
-    laws = [make_law(setting.controller, numbers.make(each, times))(setting).linear for each in points]
-    parts = [_leave_states(laws, ticks) for ticks in stretches]
-    table, target = (np.concatenate(each) for each in zip(*parts, strict=True))
+    laws = [make_law(setting.controller, numbers.make(each, times), balanced=False)(setting).linear for each in points]
+    table, target = (np.concatenate(each) for each in zip(*(run.leave_states(laws) for run in runs), strict=True))
     size = np.maximum(np.linalg.norm(table, axis=0), np.finfo(float).tiny)
     solved = np.linalg.lstsq(table / size, target, rcond=1e-12)[0] / size
     return numbers.make(own * (1.0 + 0.5 * solved), times), target - table @ solved
-
-
-def _leave_states(
-    laws: Sequence[RunnableLaw], ticks: Ticks
-) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-    """Return what each of the laws makes more than the first, and the logged commands less those of the first, from
-    zero, both without what a state at the first row adds.
-    """
-    first, *others = (_respond(law, ticks) for law in laws)
-    basis = np.linalg.qr(first[1] / np.maximum(np.linalg.norm(first[1], axis=0), np.finfo(float).tiny))[0]
-    columns = np.column_stack([*(out - first[0] for out, _ in others), ticks.command - first[0]])
-    columns -= basis @ (basis.T @ columns)
-    return columns[:, :-1], columns[:, -1]
-
-
-def _respond(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
-    """Return the commands of a law that starts from zero, and what each state at the first row adds to them, where no
-    limit is active.
-    """
-    from scipy.signal import fftconvolve  # deferred: 0.3 s
-
-    n = len(ticks)
-    direct, drive = drive_law(law, ticks)
-    rows = list_powers(law.c, law.a, n)
-    out = direct.copy()
-    for row, values in zip(rows.T, drive.T, strict=True):
-        out[1:] += fftconvolve(row, values)[: n - 1]
-    return law.per_effort * out, law.per_effort * rows
 
 
 def _find_free(setting: Setting) -> list[Ticks]:

@@ -25,7 +25,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Complex, Float
 
 from seaopt.control import (
     Controller,
@@ -263,12 +263,34 @@ def count_head(law: RunnableLaw) -> int:
     return int(min(max(HEAD, HEAD_DECAYS * slowest), LONGEST_HEAD))
 
 
-def drive_law(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n m"]]:
-    """Return what reference and readings add to the effort at once, and to the next state, at each row."""
-    columns, direct = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
-    reference, added = _compensate(law, ticks)
-    effort = law.d_reference * reference - ticks.measured @ direct + added
-    return effort, np.outer(reference, law.b_reference) - ticks.measured @ columns.T
+@record(eq=False)
+class Inputs:
+    """What a law is given over rows in which no limit acts, for any number of laws that have the same terms."""
+
+    columns: Float[np.ndarray, "n m"]  # the reference with what terms add to it, and the readings
+    added: Float[np.ndarray, " n"]  # what terms add to the effort
+    spectra: Complex[np.ndarray, "f m"]  # of the columns
+
+    @classmethod
+    def make(cls, law: RunnableLaw, ticks: Ticks) -> Inputs:
+        """Return what a law, and any with its terms, is given."""
+        reference, added = _compensate(law, ticks)
+        columns = np.column_stack([reference, ticks.measured])
+        return cls(columns=columns, added=added, spectra=transform(columns))
+
+    def respond(self, law: RunnableLaw) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n k"]]:
+        """Return the commands of a law that starts from zero, and what each state at the first row adds to them."""
+        n = len(self.columns)
+        rows = list_powers(law.c, law.a, n)
+        weights = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
+        out = self.columns @ np.append(law.d_reference, -np.ravel(law.d_measurement)) + self.added
+        out[1:] += np.fft.irfft(np.sum(transform(rows @ weights) * self.spectra, axis=1))[: n - 1]
+        return law.per_effort * out, law.per_effort * rows
+
+
+def transform(columns: Float[np.ndarray, "n m"]) -> Complex[np.ndarray, "f m"]:
+    """Return spectra of columns with zeros behind them, whose products are those of convolutions that do not wrap."""
+    return np.fft.rfft(columns, 1 << (2 * len(columns) - 1).bit_length(), axis=0)
 
 
 def _compensate(law: RunnableLaw, ticks: Ticks) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -319,13 +341,17 @@ def follow(
     """Return the commands, not limited, of a law that starts from zero and whose limit acts in the rows where it does
     in the log; with a share of the limit. That is linear in reference, readings and share.
     """
-    direct, drive = drive_law(law, ticks)
+    if not np.any(limited) or not math.isfinite(law.force_limit_N):
+        return Inputs.make(law, ticks).respond(law)[0]
+    columns, (reference, added) = np.reshape(law.b_measurement, (law.c.size, -1)), _compensate(law, ticks)
+    direct = law.d_reference * reference - ticks.measured @ np.ravel(law.d_measurement) + added
+    drive = np.outer(reference, law.b_reference) - ticks.measured @ columns.T
     x, out, most = np.zeros(law.c.size), np.empty(len(ticks)), share * law.force_limit_N
     signs, at_limit = np.sign(ticks.command), limited.tolist()
     for k in range(len(ticks)):
         out[k] = float(law.c @ x) + direct[k]
         x = law.a @ x + drive[k]
-        if at_limit[k] and math.isfinite(law.force_limit_N):
+        if at_limit[k]:
             x = x + law.anti_windup * (most * signs[k] - out[k])
     return law.per_effort * out
 
