@@ -302,7 +302,7 @@ def _build_program(
     options = {
         "print_time": False, "error_on_fail": False, "show_eval_warnings": False,
         "ipopt": {"print_level": 0, "sb": "yes", "max_iter": 80, "tol": 1e-6, "acceptable_tol": 1e-4,
-                  "mu_init": 1e-3, "acceptable_iter": 5, "warm_start_init_point": "no", "max_wall_time": 5.0,
+                  "mu_init": 1e-3, "acceptable_iter": 5, "warm_start_init_point": "no",
                   # Scaled already and small: MUMPS's own scaling and ordering take longer than its solution.
                   "mumps_pivot_order": 0, "mumps_permuting_scaling": 0, "mumps_scaling": 0},
     }  # fmt: skip
