@@ -17,7 +17,9 @@ from seaopt.cli.provenance import FILES
 from seaopt.cli.session import SCHEMAS, Session
 from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
-from seaopt.control import Controller, ForceMPC, ScheduledController
+from seaopt.codec import from_content
+from seaopt.control import Controller, ForceMPC, MPCSpec, ScheduledController
+from seaopt.control.mpc.stored import TUNE_AGAIN, check_described
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json, write_text
 from seaopt.logs import write_log
@@ -94,7 +96,7 @@ def accept_logs(
             source,
             read,
             at=at,
-            others=_find_others(folder, path),
+            others=_find_others(session, folder, path),
             uncertainty=session.parameters(),
             ranges=take_ranges(controller, session.problem.ranges),
             played=_find_played(folder, stage, path),
@@ -196,6 +198,20 @@ def _read_stage(session: Session, path: Path) -> Source:
     return Controller.from_dict(content, list_plants(problem, session.parameters())[0], session.values())
 
 
+def _read_plan(session: Session, content: dict[str, Any]) -> ForceMPC | None:
+    """Return the predictive control that a file describes; None where it is none, or other parameters made it."""
+    problem = session.problem
+    if problem.mpc is None or "mpc" not in content:
+        return None
+    try:
+        spec = from_content(MPCSpec, content["mpc"]["spec"], "mpc.spec", remedy=TUNE_AGAIN)
+        plan = design_mpc(replace(problem, mpc=spec), session.parameters())
+        check_described(content["mpc"], plan, source="mpc", problem=str(problem.source), remedy=TUNE_AGAIN)
+    except (SeaoptError, KeyError, TypeError):
+        return None
+    return plan
+
+
 def _list_units(controller: Controller) -> dict[str, str]:
     """Return the channels that a log of a controller has, with their units."""
     command = controller.command
@@ -208,16 +224,19 @@ def _list_units(controller: Controller) -> dict[str, str]:
     return {REFERENCE: reference, command.input: command.unit, **read}
 
 
-def _find_others(folder: Path, own: Path) -> dict[str, Controller | ScheduledController]:
-    """Return the other controllers that lie in a folder, and two levels below, by their files."""
-    others: dict[str, Controller | ScheduledController] = {}
+def _find_others(session: Session, folder: Path, own: Path) -> dict[str, Source]:
+    """Return the other controllers that lie in a folder, and two levels below, by their files; predictive control that
+    other parameters made by its linear law.
+    """
+    others: dict[str, Source] = {}
     for path in sorted([*folder.glob("*.json"), *folder.glob("*/*.json"), *folder.glob(f"{BRING_UP}/*/*.json")]):
         if path == own or not path.is_file():
             continue
         try:
             content = read_json(path, SCHEMAS["tune"])
             kind = ScheduledController if content.get("schedule") else Controller
-            others[str(path.relative_to(folder))] = kind.read(content)
+            plan = _read_plan(session, content)
+            others[str(path.relative_to(folder))] = kind.read(content) if plan is None else plan
         except SeaoptError:  # another kind of file, or of another version
             continue
     return others

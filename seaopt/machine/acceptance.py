@@ -153,7 +153,7 @@ def accept(
         The reference's channel; "reference" or "ref" if left out.
     at : float, optional
         Where a schedule's variable stood, of logs that do not have it.
-    others : mapping of name to Controller, optional
+    others : mapping of name to Controller, ScheduledController or ForceMPC, optional
         Laws that may have run in its place, such as those of earlier tunings.
     uncertainty : Fit or ParameterSet, optional
         What a machine may be, with `ranges`, such as the controller was certified for: draws of it say how far one may

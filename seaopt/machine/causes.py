@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control import Controller, ForceMPC, RunnableSchedule, ScheduledController, runnable
+from seaopt.control import ForceMPC, RunnableSchedule, ScheduledController
 from seaopt.control.laws.structures import Gains
 from seaopt.errors import SeaoptError
 from seaopt.machine.free_gains import find_same, fit_gains, make_law, read_gains
@@ -23,13 +23,16 @@ from seaopt.machine.stepped import (
     Match,
     Others,
     Setting,
+    Source,
     count_head,
     find_at_limit,
     find_limited,
     find_modes,
     follow,
     limit_law,
+    make_setting,
     play,
+    stand,
 )
 from seaopt.machine.ticks import Ticks
 from seaopt.records import record
@@ -227,15 +230,16 @@ def list_others(setting: Setting, others: Others) -> Iterator[Alternative]:
     law, signals = setting.law, setting.controller.signals
     over = law.table.over if isinstance(law, RunnableSchedule) else None
     for name, other in others.items():
-        first = other.controllers[0] if isinstance(other, ScheduledController) else other
-        if first.signals == signals and (isinstance(other, Controller) or other.over == over):
+        placed = not isinstance(other, ScheduledController) or other.over == over
+        if placed and stand(other, None).signals == signals:
             yield Alternative(kind="another law", what=name, change=lambda given, other=other: _take_law(given, other))
 
 
-def _take_law(setting: Setting, other: Controller | ScheduledController) -> Setting:
+def _take_law(setting: Setting, other: Source) -> Setting:
     if isinstance(other, ScheduledController):
         return replace(setting, law=other.runnable())
-    return replace(setting, controller=other, law=runnable(other))
+    taken = make_setting(other, setting.ticks)
+    return replace(setting, controller=taken.controller, law=taken.law)
 
 
 def _change_ticks(change: Callable[[Ticks], Ticks]) -> Callable[[Setting], Setting]:

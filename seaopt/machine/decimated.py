@@ -31,7 +31,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control import Controller, RunnableSchedule
+from seaopt.control import Controller, RunnableSchedule, ScheduledController
 from seaopt.control.laws.structures import Gains
 from seaopt.control.loops.law import Law
 from seaopt.errors import LogError
@@ -40,7 +40,7 @@ from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_pa
 from seaopt.machine.free_gains import read_gains
 from seaopt.machine.response.periods import Blocks, cut_periods
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
-from seaopt.machine.stepped import SAME_PLACE, Others, Setting
+from seaopt.machine.stepped import SAME_PLACE, Others, Setting, stand
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
@@ -221,8 +221,8 @@ class Table:
         """Return what commands so many ticks earlier are multiplied by."""
         return shift_command(self.controller, replace(self.blocks, effort=np.ones_like(self.made)), ticks).effort
 
-    def list_shifts(self, others: Others) -> Iterator[Shift]:
-        """Yield what may run in place of the law, or stand in its log."""
+    def list_shifts(self, others: Others, place: float) -> Iterator[Shift]:
+        """Yield what may run in place of the law, or stand in its log; `place`: of the variable of a schedule."""
         controller, blocks, made = self.controller, self.blocks, self.made
         law, signals = controller.law, controller.signals
         forward, *feedback = evaluate(law, blocks, self.ticks_per_row)
@@ -238,12 +238,10 @@ class Table:
             role = "excluded" if late == 1 else "tried"
             yield Shift(kind="late", what="readings", commands=commands, value=late, unit="ticks", role=role)
         for name, other in others.items():
-            if (
-                isinstance(other, Controller)
-                and other.signals == signals
-                and math.isclose(other.sample_time_s, law.sample_time_s, rel_tol=1e-3)
-            ):
-                yield Shift(kind="another law", what=name, commands=self.differ(other.law))
+            first = other.controllers[0] if isinstance(other, ScheduledController) else stand(other, None)
+            if first.signals == signals and math.isclose(first.sample_time_s, law.sample_time_s, rel_tol=1e-3):
+                stood = other.table.law(place) if isinstance(other, ScheduledController) else first.law
+                yield Shift(kind="another law", what=name, commands=self.differ(stood))
         gains = read_gains(controller)
         if gains is not None:
             yield from self._list_gains(gains)
@@ -292,7 +290,9 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
         return LineMatch(causes=(leave_open("terms", "law"),))
     if ticks.rendered is not None:
         return LineMatch(causes=(leave_open("outer", "loop"),))
+    place, others = math.nan, _keep_over(others, law.table.over if isinstance(law, RunnableSchedule) else None)
     if isinstance(law, RunnableSchedule):
+        place = law.fallback if ticks.middle is None else ticks.middle
         moved = 0.0 if ticks.place is None else float(np.ptp(ticks.place))
         if moved > SAME_PLACE * np.ptp(law.table.points):
             return LineMatch(causes=(leave_open("moving", law.table.over),))
@@ -308,7 +308,7 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
         blocks = blocks.average()
     table = Table.make(controller, ticks, blocks, ticks_per_row)
     tried = [table.try_late(late) for late in LATE]
-    found, shifts = min(tried, key=lambda each: each.misfit), [*table.list_shifts(others)]
+    found, shifts = min(tried, key=lambda each: each.misfit), [*table.list_shifts(others, place)]
     every, possible = [*shifts, *table.list_late(found.late)], ()
     vectors = [table.average(shift.commands) for shift in every]
     if is_off(found, every, vectors):
@@ -326,6 +326,15 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
     size = np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0)) * abs(controller.command.per_effort)
     allowed = float(np.sqrt(np.sum((found.std * size) ** 2)))
     return LineMatch(causes=causes, off=np.abs(found.mean) * size, allowed=allowed, late=found.late, possible=possible)
+
+
+def _keep_over(others: Others, over: str | None) -> Others:
+    """Return the laws that may run in place of one, scheduled over a variable or not: none scheduled over another."""
+    return {
+        name: other
+        for name, other in others.items()
+        if not isinstance(other, ScheduledController) or other.over == over
+    }
 
 
 def evaluate(law: Law, blocks: Blocks, ticks_per_row: int, image: int = 0) -> Complex[np.ndarray, "k m"]:

@@ -57,7 +57,7 @@ INTEGRATES = 1e-6  # distance from 1 of a pole that does not decay
 LEVELS, MOVING = 200, 0.5  # of a reference that is taken for rounded; what has fewer, and moves in fewer rows, is steps
 LONGEST_RESPONSE = 5000  # rows after which an impulse has left what the integrals hold of it
 Source = Controller | ScheduledController | ForceMPC
-Others = Mapping[str, Controller | ScheduledController]  # laws that may have run in a law's place, by name
+Others = Mapping[str, Source]  # laws that may have run in a law's place, by name
 State = LawState | MPCState
 
 
@@ -90,7 +90,7 @@ def stand(source: Source, place: float | None) -> Controller:
         return source.at(min(max(source.fallback if place is None else place, low), high))
     if isinstance(source, ForceMPC):
         linear = linear_controller(source)
-        return replace(linear, spec=replace(linear.spec, command_limit=source.command_limit))
+        return replace(linear, spec=replace(linear.spec, command_limit=source.command_limit), gate=source.gate)
     return source
 
 

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import LawState, MPCSpec, ScheduledController, force_mpc, runnable, tune_schedule
+from seaopt.control import (
+    LawState,
+    MPCSpec,
+    PlausibilityGate,
+    ScheduledController,
+    force_mpc,
+    runnable,
+    tune_schedule,
+)
 from seaopt.control.running.law_step import run_law
 from seaopt.machine.design_run import run_design
 from seaopt.machine.free_gains import read_gains
@@ -133,6 +141,38 @@ def test_predictive_control_at_its_limits_is_replayed(planned):
     assert row.met and row.saturated > 0.02 and row.largest < 1e-6
 
 
+@pytest.mark.slow
+def test_older_predictive_control_is_named_where_it_is_at_its_limits(planned, compiler, tmp_path):
+    """Its linear law would not do there."""
+    older = force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=15))
+    jump = np.where(np.arange(800) % 400 < 200, 0.0, 2400.0)
+    log = Bench(compiler, tmp_path, older).log(Machine(), jump)
+    (row,) = so.accept(planned.controller, [log], others={"old/controller.json": older}).replays
+    assert row.saturated > 0.02 and not row.met
+    assert (row.causes[0].kind, row.causes[0].what) == ("another law", "old/controller.json") and row.causes[0].explains
+    right = planned.log(Machine(), jump)
+    assert so.accept(planned.controller, [right], others={"old/controller.json": older}).replayed
+
+
+@pytest.mark.slow
+def test_a_gate_of_predictive_control_that_tripped_is_named(planned):
+    """Its sensor fails in a row, and stays."""
+    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_A_per_s=50.0)
+    gated, first = replace(planned.controller, gate=gate), 2500
+    log = planned.log(Machine(), SHORT)
+    force = np.where(np.arange(len(log)) < first, log["F1"], 9000.0)
+    state, current = gated.start, np.empty(len(log))
+    for k, (goal, read) in enumerate(zip(log["reference"].tolist(), force.tolist(), strict=True)):
+        step = gated.step(state, goal, read)
+        current[k], state = step.current_A, step.state
+    assert np.allclose(current[:first], log["I"][:first], atol=1e-6) and np.all(current[first + 500 :] == 0.0)
+    taken = so.Log.from_arrays(time=log.time, source="bench", reference=log["reference"], F1=force, I=current)
+    result = so.accept(gated, [taken])
+    (row,) = result.replays
+    assert row.met and (row.trip.row, row.trip.readings, row.trip.why) == (first, 4, "range")
+    assert "the gate tripped at" in " ".join(repr(result).split())
+
+
 def refuse(fraction):
     raise so.SeaoptError("no slower law")
 
@@ -193,6 +233,18 @@ def test_an_older_gain_table_is_named_by_its_file(schedule, scheduled, compiler,
     assert (row.causes[0].kind, row.causes[0].what) == ("another law", "old/controller.json")
     right = scheduled.log(Machine(), REFERENCE, places=places)
     assert so.accept(schedule, [right], others={"old/controller.json": read}).replayed
+
+
+def test_an_older_gain_table_is_named_in_a_log_of_every_second_tick(schedule, compiler, tmp_path):
+    older = tune_schedule(STAND, THOR, replace(schedule.controllers[0].spec, bandwidth_hz=20), "k", [5e5, 8e5])
+    read = ScheduledController.read(older.to_dict())
+    places = np.full(REFERENCE.size, 5.5e5)
+    log = Bench(compiler, tmp_path, older).log(SOFT, REFERENCE, places=places)
+    columns = {name: log[name][2:-2:2] for name in ("reference", "F1", "I", "k")}
+    log = so.Log.from_arrays(time=log.time[2:-2:2], **columns)
+    (row,) = so.accept(schedule, [log], others={"old/controller.json": read}).replays
+    assert row.ticks_per_row == 2 and not row.met and row.causes[0].explains
+    assert (row.causes[0].kind, row.causes[0].what) == ("another law", "old/controller.json")
 
 
 def test_a_cascade_is_replayed_and_another_set_of_its_gains_is_named():
