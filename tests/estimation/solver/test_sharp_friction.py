@@ -9,6 +9,9 @@ import pytest
 
 import seaopt as so
 from seaopt.errors import EstimationError
+from seaopt.estimation.problem.fit_problem import count_evaluations, pose_problem
+from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.solver.prediction import find_predicting_start
 from seaopt.simulation import count_stable_steps, make_model
 from tests.stick_slip import Mass, simulate
 
@@ -58,6 +61,19 @@ def test_what_is_told_of_smooth_friction_is_no_bound(bench, truth):
     assert not cause.preferred and "sticks = true" in cause.proposal
     again = so.fit([bench], truth.update(v_s=1e-5).free(*FREE))
     assert again.met and not again.findings
+
+
+@pytest.mark.parametrize("v_s", [1e-3, 1e-5])
+def test_a_predicting_start_ends_where_its_cost_is_flat(bench, truth, v_s):
+    """Friction that is sharp for its few integration steps leaves kinks: it took 64 and 82 evaluations."""
+    off = {"k": 1.2, "J": 1.5, "b_r": 0.6, "f_c": 0.6}
+    start = truth.update(v_s=v_s, **{name: factor * truth[name].value for name, factor in off.items()})
+    problem = pose_problem((bench,), start.free(*FREE), loss=Squares())
+    before = count_evaluations()
+    z = find_predicting_start(problem, problem.unknowns.start, 120)
+    assert z is not None and count_evaluations() - before < 40
+    for name, value in zip(problem.shared_names, z, strict=False):
+        assert value == pytest.approx(truth[name].value, rel=0.15), name
 
 
 def test_friction_that_takes_too_long_is_fitted_as_it_jumps(bench, truth):
