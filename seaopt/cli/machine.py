@@ -86,6 +86,9 @@ def accept_logs(
     units = _list_units(controller)
     if isinstance(source, ScheduledController):
         units[source.over] = source.unit
+    link = None
+    if source.outer is not None and source.outer.plant in session.problem.plants:
+        link = session.problem.plants[source.outer.plant], session.values()
     with show_progress(errors, "judging the logs", errors.say) as tell:
         tell("reading the logs", 0.0)
         read = [read_loop_log(session.problem, log, units, reference) for log in logs]
@@ -98,8 +101,9 @@ def accept_logs(
             at=at,
             others=_find_others(session, folder, path),
             uncertainty=session.parameters(),
-            ranges=take_ranges(controller, session.problem.ranges),
+            ranges=take_ranges(controller, session.problem.ranges, link),
             played=_find_played(folder, stage, path),
+            link=link,
         )
     certificate, broken = _find_certificate(folder, stage, path)
     result = replace(result, certificate=certificate, broken=broken)

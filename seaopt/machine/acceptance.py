@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -24,12 +25,14 @@ from seaopt.machine.differences.certified import Differences, compare
 from seaopt.machine.differences.rate_of_commands import find_rate
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
+from seaopt.machine.response.enclosed import enclose_outer, enclose_ticks
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
 from seaopt.machine.response.tripped import Trip, find_refused, find_trip
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand
 from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference_unit, take_ticks
 from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
 from seaopt.records import Result, Worded, record
 from seaopt.robustness import check_ranges
 from seaopt.units import unit_after
@@ -41,9 +44,10 @@ FEWER_TICKS = (
     "log of every n-th has not"
 )
 OUTER_LOOP = (
-    "an outer loop was closed around the law, so that the link and what touches it are in the response; for the law's "
-    "own leave it out, with the link as in the design plant, and give the law the reference of the bring-up itself"
+    "an outer loop was closed around the law, so that the link and what touches it are in the response; give the plant "
+    "of the link (link), or leave the outer loop out, with the link as in the design plant"
 )
+WITH_OTHERS = "an outer loop was closed around the law, and not in other logs; judge logs with it by themselves"
 OTHER_LAW = "the logs are not of this law; mend that first, then record again"
 TRIPPED = "the gate tripped before the reference had repeated often enough; record all of it again"
 UNTOLD_LAW = "the logs do not tell whether they are of this law"
@@ -76,6 +80,8 @@ class Acceptance(Result, Worded):
     stepped : Difference or None
         The rate at which the law is stepped, where no log has a response and what the machine made of the commands
         tells that it is another than that of the log's clock.
+    enclosed : bool
+        Whether the response is that of the loop with the law's outer loop in it, on the plant of its link.
     certificate : {"met", "failed", "missing"} or None
         Of the law; None where nothing is known of one, as in `accept`. Without one that is met the law is not accepted.
     broken : tuple of str
@@ -92,6 +98,7 @@ class Acceptance(Result, Worded):
     gaps: tuple[Gaps | None, ...] = ()
     stepped: Difference | None = None
     experiments: tuple[Log, ...] = ()
+    enclosed: bool = False
     certificate: Literal["met", "failed", "missing"] | None = None
     broken: tuple[str, ...] = ()
 
@@ -120,6 +127,7 @@ class Acceptance(Result, Worded):
             "certificate_failed": self.broken,
             "replay": {"met": self.replayed, "logs": logs},
             "response": None if self.response is None else self.response.to_dict(),
+            "enclosed": self.enclosed,
             "differences": self.differences,
             "left_out": self.left_out,
             "stepped": self.stepped,
@@ -139,6 +147,7 @@ def accept(
     ranges: Mapping[str, tuple[float, float]] | None = None,
     confidence: float = 0.95,
     played: Played | None = None,
+    link: tuple[Plant, ParameterSet] | None = None,
 ) -> Acceptance:
     """Judge logs that were recorded under a controller's exported law.
 
@@ -164,6 +173,8 @@ def accept(
         Of each statement on the response.
     played : Played, optional
         How long the reference is that was to be played: a log that is shorter than its period is told so.
+    link : (Plant, ParameterSet), optional
+        The plant whose link the law's outer loop moves, with its values, for logs in which it ran.
 
     Returns
     -------
@@ -184,8 +195,10 @@ def accept(
     Laws with another part that it does not exclude are its replay's `possible`.
 
     A law with an outer loop is replayed with it where the reference is the link's place, in m or rad, and the link's
-    position is in the log; no response follows. A reference in N or N m is the one that the force law was given, or,
+    position is in the log; with `link` the response is that of the whole loop, broken at the command, on this plant, as
+    certified: nothing is asked of its bandwidth. A reference in N or N m is the one that the force law was given, or,
     without a stiffness, the force that the outer loop's damping is added to: whichever the law makes the command of.
+    Of logs with and without the outer loop the response is of those without.
 
     Law and log go by ticks, and so does the clock of a log that has none of its own: a law that is stepped at another
     rate makes the logged command all the same. The machine goes by seconds, and its response tells the rate; then all
@@ -225,7 +238,8 @@ def accept(
     if not 0.5 <= require_number(confidence, "confidence", LogError) < 1.0:
         raise LogError(f"confidence = {confidence:g} is not between 0.5 and 1; give 0.95")
     if ranges and controller.design is not None:
-        check_ranges(ranges, {"design plant": controller.design[0]})
+        plants = {"design plant": controller.design[0]} | ({} if link is None else {"link": link[0]})
+        check_ranges(ranges, plants)
     rows, replays = list[Ticks](), list[Replay]()
     for log, ticks in zip(logs, list_ticks(controller, logs, reference, at), strict=True):
         tried, outer = [(ticks, replay(controller, ticks, others))], stand(controller, at).outer
@@ -272,10 +286,17 @@ def accept(
     ]
     rows = [_end_at_trip(ticks, find_trip(law, ticks)) for ticks in rows]
     blocks, left_out = list[Blocks](), dict[str, str]()
+    around = all(ticks.rendered is not None for ticks in rows)
+    if around and link is not None:
+        enclosed = enclose_outer(law, link)
+        rows, law = [enclose_ticks(enclosed, law, ticks) for ticks in rows], enclosed
+        result = replace(result, enclosed=True)
+    apart = result.controller if result.enclosed else None
+    judge = partial(judge_response, tracks=apart is None)
     for ticks, row in zip(rows, replays, strict=True):
         try:
             if ticks.rendered is not None:
-                raise LogError(OUTER_LOOP)
+                raise LogError(OUTER_LOOP if around else WITH_OTHERS)
             if len(ticks) < FEWEST:
                 raise LogError(TRIPPED)
             refused = find_refused(law, ticks) if row.ticks_per_row == 1 else None
@@ -289,19 +310,19 @@ def accept(
         stepped = next((each for each in told if each is not None), None)
         kept = () if stepped is not None else result.experiments  # whose clock is wrong
         return replace(result, left_out=left_out, stepped=stepped, experiments=kept)
-    response = judge_response(law, join_blocks(blocks), confidence)
+    response = judge(law, join_blocks(blocks), confidence)
     whole = [ticks for ticks in rows if ticks.source not in left_out]
     if has_dry_friction(law) and any(row.ticks_per_row > 1 for row in replays):
         left_out["differences"] = FEWER_TICKS
         return replace(result, response=response, left_out=left_out)
     draws = list_draws(law, uncertainty, ranges, DRAWS, SEED)
-    differences = compare(law, response.measured, whole, draws, confidence)
+    differences = compare(law, response.measured, whole, draws, confidence, apart)
     if differences is not None and differences.prediction is not None:
-        response = judge_response(law, join_blocks(blocks), confidence, prediction=differences.prediction)
+        response = judge(law, join_blocks(blocks), confidence, prediction=differences.prediction)
     first = differences.found[0] if differences is not None and differences.found else None
     if first is not None and first.kind == "rate" and first.size and first.explains >= EXPLAINED:
         # The figures are of the machine's seconds, and the log is none for a fit.
-        response = judge_response(law, join_blocks(blocks), confidence, first.size)
+        response = judge(law, join_blocks(blocks), confidence, first.size)
         result = replace(result, experiments=())
     return replace(result, response=response, differences=differences, left_out=left_out)
 
@@ -421,10 +442,15 @@ def list_draws(
     return draw(uncertainty, count, seed, inside, find_drive(controller.spec, controller.design[0], uncertainty))
 
 
-def take_ranges(controller: Controller, ranges: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    """Return the ranges of what the design plant has, of those of all plants whose values a set may hold."""
-    if controller.design is None:
-        return {}
-    plant, values = controller.design
-    names = {*plant.parameters, *(conditions((plant,)).keys() & values.keys())}
+def take_ranges(
+    controller: Controller,
+    ranges: Mapping[str, tuple[float, float]],
+    link: tuple[Plant, ParameterSet] | None = None,
+) -> dict[str, tuple[float, float]]:
+    """Return the ranges of what the design plant has, or that of a moving link, of those of all plants whose values a
+    set may hold.
+    """
+    names = set[str]()
+    for plant, values in (pair for pair in (controller.design, link) if pair is not None):
+        names |= {*plant.parameters, *(conditions((plant,)).keys() & values.keys())}
     return {name: ends for name, ends in ranges.items() if name in names}

@@ -57,6 +57,10 @@ NO_GAINS = (
     "The law has no gains with names (it is one's own, or predictive control): a part that is left out, or a gain "
     "that is another, is not looked for in such a log; log every tick, where all of it counts."
 )
+ENCLOSED = (
+    "The loop is the whole one, with the outer loop in it, on the plant of its link, broken at the command: that is "
+    "what was certified there. Of how it tracks a force nothing is asked."
+)
 ONE_BY_ONE = "Each line by itself is within reach of some such machine, but none of them explains all lines together."
 RATE = (
     "These figures are in the machine's seconds: the law is stepped at {} times the rate that the log's clock says, "
@@ -156,7 +160,8 @@ def _say_inside(result: Acceptance, differences: Differences) -> str:
     no = "" if differences.inside else "not "
     if result.certificate == "met":
         return f"the machine is {no}one of those that were certified"
-    given = "within the uncertainty that was given" if differences.nearest else "the design plant"
+    model = "the plant of the link" if result.enclosed else "the design plant"
+    given = "within the uncertainty that was given" if differences.nearest else model
     return f"the machine is {no}{given}"
 
 
@@ -312,6 +317,8 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
         "Nothing is said between the lines and beyond them.",
         STABILITY,
     ]
+    if result.enclosed:
+        remarks.append(ENCLOSED)
     if response.rate != 1.0:
         remarks.append(RATE.format(format_number(response.rate, 3)))
     played = result.differences is not None and result.differences.prediction is not None

@@ -51,6 +51,7 @@ class Ticks:
     command: Float[np.ndarray, " n"]
     place: Float[np.ndarray, " n"] | None = None  # of a schedule, its variable
     rendered: dict[str, Float[np.ndarray, " n"]] | None = None  # parts of an outer loop, of which reference is the sum
+    given: Float[np.ndarray, "n _"] | None = None  # with them: the force that the outer loop is given, the position
     beside: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict[str, Any])  # outputs it does not read
     left_out: int = 0  # rows of the log that are not in it
     gaps: Gaps | None = None  # of the log; None where it has none
@@ -80,6 +81,7 @@ class Ticks:
             further=self.further[read],
             place=None if self.place is None else self.place[read],
             rendered=self.rendered and {name: part[rows] for name, part in self.rendered.items()},
+            given=None if self.given is None else self.given[rows],
             command=self.command[rows if command is None else command],
             beside={name: part[read] for name, part in self.beside.items()},
         )
@@ -245,7 +247,8 @@ def _render(ticks: Ticks, outer: OuterLoop, position: Float[np.ndarray, " n"]) -
     asked, damping = outer.ask(ticks.reference, position), replace(outer, stiffness=0.0).run(ticks.reference, position)
     parts = {"stiffness" if outer.stiffness else "force": asked - damping, "damping": damping}
     first = min(math.ceil(FORGETS / -math.log(outer.pole)) if outer.pole else 1, len(ticks) - FEWEST)
-    return replace(ticks, reference=asked, rendered=parts).take(slice(max(first, 1), None))
+    given = np.column_stack([outer.per_given * ticks.reference, position])
+    return replace(ticks, reference=asked, rendered=parts, given=given).take(slice(max(first, 1), None))
 
 
 def _find_longest(log: Log, whole: Any) -> slice:

@@ -8,6 +8,7 @@ import scipy.linalg
 
 import seaopt as so
 from seaopt.control import Impedance, add_impedance
+from tests.machine.simulator import multisine
 
 T = 1e-3
 KNEE = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "k_s": 300.0}
@@ -91,7 +92,7 @@ def test_the_outer_loop_is_replayed_with_the_law(impedance, first):
     result = so.accept(impedance, [make_log(rows)])
     (row,) = result.replays
     assert row.met and row.mismatch < 1e-3 * row.rms, row
-    assert result.response is None and "leave it out" in result.left_out["knee"]
+    assert result.response is None and "give the plant of the link" in result.left_out["knee"]
     assert so.accept(impedance, [make_log(rows, inner=True, position=False)]).replayed
 
 
@@ -163,3 +164,67 @@ def test_the_page_of_a_bring_up_says_what_to_log(law, words, request):
     plants = {"stand": law.design[0], "knee": so.plants.rotary()}
     plan = so.bring_up(law, plants, law.design[1], samples=2, fractions=(), limits={"tau_s": 40.0})
     assert words in " ".join(repr(plan).split())
+
+
+def take_link():
+    """Return the plant of the test's link, and its values."""
+    knee = so.plants.rotary()
+    return knee, knee.complete(so.ParameterSet()).update(**KNEE, J_l=INERTIA, d_l=DAMPER)
+
+
+LINES = np.unique(np.round(np.geomspace(2, 120, 20)).astype(int))
+
+
+def excite(stiffness, seed):
+    return multisine(2000, LINES, 8, 0.1 if stiffness else 2.0, seed)
+
+
+@pytest.mark.parametrize("stiffness", [20.0, 0.0])
+def test_the_whole_loop_of_a_right_machine_is_met_and_is_its_margin_at_the_command(impedance, damping, stiffness):
+    """Ms by the matrices of the test's own machine: 1 + L from the law with the outer loop written out by hand."""
+    law = impedance if stiffness else damping
+    rows = run(law, excite(stiffness, 3), stiffness=stiffness)
+    log = make_log(rows, unit="rad" if stiffness else "N m")
+    result = so.accept(law, [log], link=take_link())
+    assert result.met and result.enclosed and result.to_dict()["enclosed"], result
+    figures = {row.name: row for row in result.response.judged}
+    assert "bandwidth" not in figures and "with the outer loop in it" in " ".join(str(result).split())
+    f = np.linspace(1.0, 60.0, 2000)
+    z = np.exp(2j * np.pi * f * T)
+    mass, kick = KNEE["N"] ** 2 * KNEE["J_m"], KNEE["N"] * KNEE["eta"] * KNEE["K_tau"]
+    a, b = np.zeros((5, 5)), np.zeros(5)
+    a[0, 1] = a[2, 3] = 1.0
+    a[1, [0, 2]], a[1, 1] = np.array([-1.0, 1.0]) * KNEE["k_s"] / mass, -(KNEE["N"] ** 2) * KNEE["b_r"] / mass
+    a[3, [0, 2]], a[3, 3] = np.array([1.0, -1.0]) * KNEE["k_s"] / INERTIA, -DAMPER / INERTIA
+    a[1, 4] = kick / mass
+    moved = scipy.linalg.expm(a * T)
+    b[:4] = moved[:4, 4]
+    states = np.array([np.linalg.solve(each * np.eye(4) - moved[:4, :4], b[:4]) for each in z])
+    torque, angle = KNEE["k_s"] * (states[:, 0] - states[:, 2]), states[:, 2]
+    block = law.law
+    inner = np.array(
+        [block.c @ np.linalg.solve(each * np.eye(block.c.size) - block.a, block.b) + block.d for each in z]
+    )
+    speed = (z - 1.0) / ((0.005 + T) * z - 0.005)
+    outer = -law.outer.direction * (stiffness + speed) * angle  # damping of 1
+    loop = -law.per_effort * (inner[:, 1] * torque + inner[:, 0] * outer) / z  # a command waits for the next tick
+    assert figures["Ms"].value == pytest.approx(np.max(1.0 / np.abs(1.0 + loop)), rel=0.02)
+    assert figures["Ms"].predicted == pytest.approx(np.max(1.0 / np.abs(1.0 + loop)), rel=1e-3)
+
+
+def test_what_differs_under_a_running_impedance_is_named(impedance, monkeypatch):
+    link = take_link()
+    for changed, value in (("eta", 0.85 * KNEE["eta"]), ("k_s", 0.8 * KNEE["k_s"])):
+        monkeypatch.setitem(KNEE, changed, value)
+        rows = run(impedance, excite(20.0, 5))
+        monkeypatch.undo()
+        result = so.accept(impedance, [make_log(rows)], link=link)
+        best = result.differences.found[0]
+        assert result.replayed and not result.met and best.explains > 0.99
+        assert changed in str(result), (changed, result)
+        assert best.value == pytest.approx(value / KNEE[changed], abs=0.01)
+
+
+def test_a_goal_that_stands_still_says_what_to_record(impedance):
+    result = so.accept(impedance, [make_log(run(impedance, np.full(4000, 0.1)))], link=take_link())
+    assert result.replayed and result.response is None and "periodic multisine" in result.left_out["knee"]

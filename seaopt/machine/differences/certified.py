@@ -11,6 +11,7 @@ A sensor is at its range where readings pile up at an edge of what was read whil
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,18 +59,19 @@ def compare(
     logs: Sequence[Ticks],
     draws: Sequence[Values],
     confidence: float,
+    apart: Controller | None = None,
 ) -> Differences | None:
     """Return how the machine differs from a controller's design plant; None where the controller does not know it.
-    `logs`: those that `measured` comes from. `draws`: of the certificate.
+    `logs`: those that `measured` comes from. `draws`: of the certificate. `apart`: as in `Comparison`.
     """
     if controller.design is None:
         return None
     dry = has_dry_friction(controller)
     logs_taken = [*map(shorten, logs)] if dry else logs
-    comparison = Comparison(controller=controller, measured=measured, logs=logs_taken, names=controller.signals)
-    beside = Comparison(
-        controller=controller, measured=measured, logs=logs_taken, names=_list_beside(measured, controller.signals)
-    )
+    drifts = apart is not None and apart.outer is not None and not apart.outer.stiffness  # the link's place
+    names = apart.signals if drifts and apart is not None else controller.signals
+    comparison = Comparison(controller=controller, measured=measured, logs=logs_taken, names=names, apart=apart)
+    beside = replace(comparison, names=_list_beside(measured, controller.signals))
     plant, values = controller.design
     nominal = plant.complete(values)
     response, count = comparison.response, comparison.f.size

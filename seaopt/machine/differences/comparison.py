@@ -40,6 +40,7 @@ class Comparison:
     names: tuple[str, ...]  # of the outputs
     rate: float = 1.0  # at which the model's law is stepped, over what the clock of the logs says
     simulated: bool = False  # whether the model is, without dry friction too
+    apart: Controller | None = None  # the law and its outer loop as they run, where `controller` has both in one
 
     @property
     def plant(self) -> Plant:
@@ -103,7 +104,10 @@ class Comparison:
         """Return the periods of the law on the nonlinear plant with each of some values, under the logged references
         and cut as the logs are, by amplitude.
         """
-        runs = [run_design(self.controller, sets, ticks.reference, rate=self.rate) for ticks in self.logs]
+        source, share = self.controller, 1.0
+        if self.apart is not None and self.apart.outer is not None:
+            source, share = replace(self.apart, design=source.design), 1.0 / self.apart.outer.per_given
+        runs = [run_design(source, sets, share * ticks.reference, rate=self.rate) for ticks in self.logs]
         return [self._cut([run.outputs for run in runs], k) for k in range(len(sets))]
 
     def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> list[Blocks]:

@@ -49,6 +49,7 @@ GRACE = 0.05  # of each limit: a machine is not its model to the last digit
 SHORT_BY = 0.1  # of the bandwidth
 CENTRE = 1.0 - 1e-9  # a risk at which discs are points
 MOST_PERIODS = 1e6  # that are counted
+TRACKING = ("reference peak", "bandwidth")
 HOUR = 3600.0  # s: a record that is longer is not asked for
 
 
@@ -173,10 +174,12 @@ def judge_response(
     confidence: float,
     rate: float = 1.0,
     prediction: Prediction | None = None,
+    *,
+    tracks: bool = True,
 ) -> Response:
     """Return the response of periods, a group per amplitude, and what it says of the controller's limits. `rate`: at
     which the law was stepped, over what the clock of the logs says; `prediction`: of the same references, with dry
-    friction.
+    friction; `tracks`: whether the reference is what the force is to be.
     """
     friction = find_friction(controller)
     dry = friction > 0.0
@@ -192,6 +195,8 @@ def judge_response(
         _judge_bandwidth(controller, measured, alpha, prediction),
         *list_margins(controller, measured, alpha),
     ]
+    if not tracks:
+        rows = [row for row in rows if row.name not in TRACKING]
     if prediction is not None:
         rows = [replace(row, predicted=prediction.figures.get(row.name)) for row in rows]
     if needs_phases:  # nothing is confirmed, for the discs do not hold the truth

@@ -1,0 +1,49 @@
+"""A law and the outer loop around it as one law, which reads the link's position, too, on the plant of that link.
+
+What the outer loop is given is known without error, which the force law's own reference is not: that has the readings
+of the position in it. From there on the loop is one as any other, broken at the command.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from seaopt.control import Controller
+from seaopt.control.laws.outer_run import close_outer, enclose
+from seaopt.control.loops.moved_link import find_position, keep_share, show_position
+from seaopt.errors import LogError
+from seaopt.machine.ticks import Ticks
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
+
+
+def enclose_outer(controller: Controller, link: tuple[Plant, ParameterSet]) -> Controller:
+    """Return a controller whose law has the outer loop in it, on the plant whose link that moves, with the figures of
+    that loop: nothing is asked of how it tracks a force. Raises LogError: the plant has no such position.
+    """
+    outer, (plant, values) = controller.outer, link
+    assert outer is not None
+    shown = show_position(plant, outer, controller.signals)
+    if find_position(shown, outer) is None:
+        raise LogError(f"link: {plant.name} has no output {outer.position}; give the plant that the outer loop is of")
+    law, reads = enclose(controller, shown, of_force=True)
+    figures = close_outer(controller, take_sliding(plant, values), values).figures()
+    return replace(controller, law=law, reads=reads, outer=None, design=(shown, values), achieved=figures)
+
+
+def enclose_ticks(enclosed: Controller, controller: Controller, ticks: Ticks) -> Ticks:
+    """Return the ticks of a controller as those of its law with the outer loop in it."""
+    from scipy.signal import lfilter  # deferred: 0.3 s
+
+    assert ticks.given is not None and controller.outer is not None and enclosed.design is not None
+    given, position = ticks.given.T
+    kept = keep_share(find_position(enclosed.design[0], controller.outer) or "")
+    if kept < 1.0:  # a link that nothing holds, whose place drifts
+        position = np.asarray(lfilter([1.0, -1.0], [1.0, -kept], position - position[0]))
+    measured = ticks.measured if len(enclosed.signals) == len(controller.signals) else None
+    measured = np.column_stack([ticks.measured, position]) if measured is None else measured
+    beside = {name: part for name, part in ticks.beside.items() if name not in enclosed.signals}
+    return replace(ticks, reference=given, measured=measured, beside=beside, rendered=None, given=None)
