@@ -33,7 +33,7 @@ from seaopt.plants.motor.thermal import AMBIENT, find_warm_range
 from seaopt.progress import Progress, divide
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Budget
-from seaopt.robustness.certificate.requirement import DESIGN_PLANT, MIN_FRICTION_MARGIN, Requirement, Spot
+from seaopt.robustness.certificate.requirement import DESIGN_PLANT, MIN_FRICTION_MARGIN, CheckScope, Requirement, Spot
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source, Uncertainty, check_ranges, combine_uncertainty
 from seaopt.robustness.uncertainty.worst import place_values
 
@@ -144,6 +144,8 @@ class Evidence:
     requirements: Sequence[Requirement] = ()
     fields: Mapping[str, Any] = field(default_factory=dict[str, Any])  # of the certificate
     remarks: tuple[str, ...] = ()
+    scope: CheckScope = ""  # of the requirements, and
+    risk: float | None = None  # the check's share of the risk, of those that state none themselves
 
 
 @record(eq=False)
@@ -161,7 +163,11 @@ def ask(checks: Sequence[Check], survey: Survey, progress: Progress) -> Evidence
     rows, remarks = list[Requirement](), list[str]()
     for check, part in zip(asked, divide(progress, *(check.seconds(survey) for check in asked)), strict=True):
         evidence = check.measure(survey, part)
-        rows += (replace(row, place=row.place or survey.place) for row in evidence.requirements)
+        said = [evidence.risk if row.risk is None else row.risk for row in evidence.requirements]
+        rows += (
+            replace(row, place=row.place or survey.place, scope=evidence.scope, risk=risk)
+            for row, risk in zip(evidence.requirements, said, strict=True)
+        )
         remarks += evidence.remarks
         survey = replace(survey, found={**survey.found, **evidence.fields})
     return Evidence(requirements=rows, fields=survey.found, remarks=tuple(remarks))

@@ -274,7 +274,7 @@ class Certificate(Result, Worded):
         )
         played = (SIMULATION_FAILURES, *NAMED_FAULTS.values())  # which are played again
         kept = (row for row in self.requirements if row.name not in played)
-        rows = (replace(row, place=self.place) for row in require_simulated(simulated))
+        rows = (replace(row, place=self.place, scope="simulated") for row in require_simulated(simulated))
         return replace(self, simulated=simulated, requirements=(*kept, *rows))
 
     @property

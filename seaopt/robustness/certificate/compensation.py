@@ -75,6 +75,7 @@ def measure_compensation(survey: Survey, _: Progress) -> Evidence:
         ),
         fields={"compensation": margins, "compensation_draws": draws},
         remarks=(WITHOUT_RIPPLE,) if opened else (),
+        scope="drawn" if draws else "nominal",
     )
 
 

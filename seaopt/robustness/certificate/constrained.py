@@ -354,7 +354,7 @@ def measure_constrained(survey: Survey, progress: Progress) -> Evidence:
     """Draw and simulate runs of predictive control with limits active, each on every plant."""
     runs = run_constrained(survey, progress)
     rows = require_constrained(runs, survey.options.max_failure_probability)
-    return Evidence(requirements=rows, fields={"constrained": runs})
+    return Evidence(requirements=rows, fields={"constrained": runs}, scope="simulated")
 
 
 CONSTRAINED = Check(

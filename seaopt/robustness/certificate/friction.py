@@ -61,7 +61,8 @@ def measure_friction(survey: Survey, progress: Progress) -> Evidence:
     margins = find_nominal_margins(controller, survey.cases.models, survey.cases.unknown.nominal)
     draws = find_margins_at_draws(survey, margins)
     rows = friction_requirements(margins, draws, survey.min_friction_margin, controller.command.mechanics.damping)
-    return Evidence(requirements=rows, fields={"friction": margins, "friction_draws": draws})
+    fields = {"friction": margins, "friction_draws": draws}
+    return Evidence(requirements=rows, fields=fields, scope="drawn" if draws else "nominal")
 
 
 FRICTION = Check(measure=measure_friction, seconds=lambda survey: SECONDS * len(survey.cases.plants))

@@ -97,7 +97,8 @@ def measure_impedance(survey: Survey, progress: Progress) -> Evidence:
     impedance = certify_impedance(cases.controller, cases.models, cases.unknown.nominal)
     if impedance is not None and impedance.safe:
         impedance = replace(impedance, draws=draw_impedance(survey, progress))
-    return Evidence(requirements=impedance_requirements(impedance), fields={"impedance": impedance})
+    scope = "drawn" if impedance is not None and impedance.draws is not None else "nominal"
+    return Evidence(requirements=impedance_requirements(impedance), fields={"impedance": impedance}, scope=scope)
 
 
 IMPEDANCE = Check(

@@ -88,6 +88,7 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
             "margins": {name: plant_margins(controller, plant, nominal) for name, plant in stated.items()},
         },
         remarks=(*warn_delays(controller.spec, design, survey.source), *amplitudes, *((WITH_TERMS,) if closed else ())),
+        scope="nominal",
     )
 
 
@@ -103,10 +104,10 @@ def measure_responses(survey: Survey, _: Progress) -> Evidence:
             scopes = ("design plant", *scopes)
         for scope in scopes:
             of_response = measured_requirements(controller, name, response, scope)
-            rows += (replace(row, place=place) for row in of_response)
+            rows += (replace(row, place=place, risk=1.0 - response.confidence) for row in of_response)
         plant = controller.spec.see_response(response, controller.command)
         remarks.append(str(measure_discs(plant, controller.law, controller.spec.bandwidth_hz)))
-    return Evidence(requirements=rows, remarks=tuple(remarks))
+    return Evidence(requirements=rows, remarks=tuple(remarks), scope="measured")
 
 
 def _find_law(survey: Survey, name: str, response: MeasuredResponse) -> tuple[Controller, tuple[str, float] | None]:
@@ -144,13 +145,14 @@ def judge_logs(survey: Survey, _: Progress) -> Evidence:
             limit * (1.0 + GRACE),
             plant=f"log:{each.experiment}",
             text=describe_log(each),
+            risk=None if each.confidence is None else 1.0 - each.confidence,
         )
         for each in verdicts
     )
     remarks = [SILENT[silent.why].format(silent) for _, silent in found if silent is not None]
     if fit.experiments and not logs and survey.place is None:
         remarks.append(NO_LOG)
-    return Evidence(requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remarks))
+    return Evidence(requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remarks), scope="measured")
 
 
 def describe_log(log: LogVerdict) -> str:

@@ -65,6 +65,8 @@ def measure_uncertainty(survey: Survey, progress: Progress) -> Evidence:
     return Evidence(
         requirements=rows,
         fields={"monte_carlo": counts, "worst": worst, "brackets": brackets, "drawn_ms": drawn_ms},
+        scope="drawn",
+        risk=counts.risk,
     )
 
 

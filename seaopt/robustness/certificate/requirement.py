@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,9 @@ SPECTRAL_RADIUS = "spectral_radius"  # of which a plant that is unstable fails
 LIMIT_CYCLE = "limit_cycle"
 UNSTABLE_LOOP = "the loop is UNSTABLE"
 DESIGN_PLANT = "design plant"  # whose own limits are judged
+# Of which plants a check speaks: at the nominal parameters, at draws of them, at all of a range, those that were
+# measured, or runs that were simulated; "" in an older file.
+CheckScope = Literal["", "nominal", "drawn", "proved", "measured", "simulated"]
 
 
 class Spot(NamedTuple):
@@ -70,6 +73,10 @@ class Requirement(Result):
         What was found besides, and what to do about it.
     count : int
         Runs that miss it in the same way, of which this is the worst.
+    scope : {"nominal", "drawn", "proved", "measured", "simulated"}
+        What is known by it; "" in an older file.
+    risk : float or None
+        Share of the risk: the probability with which chance makes the statement wrong; None where none is stated.
 
     Examples
     --------
@@ -80,7 +87,7 @@ class Requirement(Result):
 
     json_keys = (
         "name", "limit", "value", "met", "sense", "tolerance", "unit", "plant", "state", Key(field="at", name="place"),
-        "scenario", "draw", "text", "remedy", "count", "where",
+        "scenario", "draw", "text", "remedy", "count", "scope", "risk", "where",
     )  # fmt: skip
 
     name: str
@@ -98,6 +105,8 @@ class Requirement(Result):
     text: str = ""
     remedy: str = ""
     count: Annotated[int, Constraints(ge=1)] = 1
+    scope: CheckScope = ""
+    risk: Annotated[float, Constraints(ge=0.0, le=1.0)] | None = None
 
     @property
     def at(self) -> Annotated[dict[str, float], Constraints(min_length=1, max_length=1)] | None:

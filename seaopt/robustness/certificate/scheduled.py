@@ -58,7 +58,7 @@ def measure_stretches(survey: Survey, progress: Progress) -> Evidence:
     bounds = map_ordered(partial(_bound_plants, shared, cases.unknown.nominal), pairs, survey.executor)
     stretches = tuple(bound for _ in count_off(pairs, "stretch", progress) for bound in next(bounds))
     rows = [*_require_limits_between(schedule), *_refute_limits_between(schedule, stretches)]
-    return Evidence(requirements=rows, fields={"stretches": stretches})
+    return Evidence(requirements=rows, fields={"stretches": stretches}, scope="proved")
 
 
 def join_places(survey: Survey, _: Progress) -> Evidence:
@@ -68,7 +68,8 @@ def join_places(survey: Survey, _: Progress) -> Evidence:
     for at, place in zip(survey.places, places, strict=True):
         worst |= name_worst(at, place.worst)
     rows = draw_requirements(counts, worst, survey.options.max_failure_probability)
-    return Evidence(requirements=rows, fields={"monte_carlo": counts, **take_worst(places)})
+    fields = {"monte_carlo": counts, **take_worst(places)}
+    return Evidence(requirements=rows, fields=fields, scope="drawn", risk=counts.risk)
 
 
 def take_worst(places: Sequence[Certificate]) -> dict[str, Any]:
@@ -104,6 +105,7 @@ def measure_sweeps(survey: Survey, progress: Progress) -> Evidence:
             *(require_motion(motion, schedule.over, unit, least) for motion in motions.values()),
         ),
         fields={"sweeps": sweeps, "motions": motions},
+        scope="simulated",
     )
 
 

@@ -128,7 +128,7 @@ def measure_steps(survey: Survey, progress: Progress) -> Evidence:
         if cycle.predicted is not None and cycle.lasts
     )
     rows = () if survey.simulations else require_runs(steps)  # else those scenarios are judged
-    return Evidence(requirements=(*lasting, *rows), fields={"steps": steps, "cycles": cycles})
+    return Evidence(requirements=(*lasting, *rows), fields={"steps": steps, "cycles": cycles}, scope="simulated")
 
 
 def measure_simulations(survey: Survey, progress: Progress) -> Evidence:
@@ -147,7 +147,7 @@ def measure_simulations(survey: Survey, progress: Progress) -> Evidence:
         progress=progress,
         **survey.devices,
     )
-    return Evidence(requirements=require_simulated(simulated), fields={"simulated": simulated})
+    return Evidence(requirements=require_simulated(simulated), fields={"simulated": simulated}, scope="simulated")
 
 
 STEPS = Check(

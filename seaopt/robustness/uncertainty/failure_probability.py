@@ -30,6 +30,11 @@ class MonteCarlo:
     over_mt: int = 0
 
     @property
+    def risk(self) -> float | None:
+        """The probability with which the bound is wrong; None where nothing was drawn."""
+        return 1.0 - self.confidence if self.samples else None
+
+    @property
     def count_text(self) -> str:
         """How many draws fail, and by what."""
         if not self.samples:

@@ -10,13 +10,14 @@ from dataclasses import replace
 import control
 import numpy as np
 import pytest
-from scipy.stats import beta, binomtest
+from scipy.stats import beta, binom, binomtest
 
 import seaopt as so
 from seaopt.control.laws.friction import find_friction_margin
 from seaopt.errors import ControlError
 from seaopt.files import seal, to_json
 from seaopt.parameters import Parameter
+from seaopt.reporting.sections import write_html
 from seaopt.robustness import batch_figures, failure_bound
 from seaopt.robustness.certificate.cases import digest_laws
 from seaopt.robustness.certificate.friction import friction_requirements
@@ -63,6 +64,19 @@ def test_it_passes_with_the_stated_bound(certificate):
     assert certificate.monte_carlo.failures == 0
     assert certificate.monte_carlo.failure_probability_bound < 0.01001
     assert "passed" in repr(certificate)
+
+
+def test_every_requirement_says_of_which_plants_and_at_which_risk(certificate):
+    draws = certificate.monte_carlo
+    said = {row.name: (row.scope, row.risk) for row in certificate.requirements}
+    assert said["max_sensitivity"] == ("nominal", None) and said["step_settling_s"] == ("simulated", None)
+    wrong = binom.cdf(draws.failures, draws.samples, draws.failure_probability_bound)  # had it the bound, so few fail
+    for name in ("monte_carlo_failures", "max_failure_probability"):
+        assert said[name] == ("drawn", pytest.approx(wrong, rel=1e-3))
+    assert [row["scope"] for row in certificate.to_dict()["requirements"]] == [
+        row.scope for row in certificate.requirements
+    ]
+    assert "drawn, risk 1e-06" in write_html(certificate)
 
 
 def test_every_requirement_carries_its_numbers(certificate):

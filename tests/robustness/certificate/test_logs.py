@@ -98,6 +98,7 @@ def test_mode_that_the_model_lacks_fails_by_the_name_of_the_log(stand, thor, fit
     (row,) = rows_of(certificate)
     (verdict,) = certificate.logs
     assert not row.met and not certificate.met
+    assert (row.scope, row.risk) == ("measured", None)  # of samples that were fitted no risk is stated
     assert row.plant == "log:chirp1" and row.limit == pytest.approx(1.6 * (1 + GRACE))
     assert verdict.outcome == "refuted" and 38.0 < verdict.ms_hz < 46.0
     assert "log:chirp1: fitted, refuted at" in row.where and f"measured Ms {verdict.ms:.3g}, pred" in row.where
@@ -120,6 +121,7 @@ def test_predictive_control_fails_by_the_name_of_a_log_too(stand, fit_to):
     spec = MPCSpec(current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0)
     mpc = force_mpc(stand, fit.parameters, spec)
     certificate = so.certify(mpc, {"stand": stand}, fit, samples=4, runs=1, simulations=False)
+    assert [row.risk for row in rows_of(certificate)] == [None, pytest.approx(0.05), pytest.approx(0.01)]
     assert [(row.plant, row.met) for row in rows_of(certificate)] == [
         ("log:chirp1", True),
         ("log:other2", True),

@@ -75,6 +75,8 @@ def test_every_stretch_is_proved_and_above_what_was_found(certificate):
     largest = max(loop.ms for place in certificate.places for loop in place.plants.values())
     assert max(one.ms for one in certificate.stretches) >= largest
     assert "proved" in certificate.proof
+    scopes = {row.scope for row in certificate.requirements if row.name == "limits_between_points"}
+    assert scopes == {"proved"} and all(row.scope for row in certificate.requirements)
     lost = replace(certificate.stretches[0], reason="no bound in 400 boxes")
     assert replace(certificate, stretches=(lost,)).proof.startswith("nothing is proved")
 
