@@ -246,10 +246,13 @@ def play(setting: Setting) -> Match:
     commands = np.concatenate([ticks.command[:first], run_setting(setting, ticks.take(slice(first, None)), start)])
     if linear.compensation is not None:  # which differences to a row before the first
         commands[0] = ticks.command[0]
+    left = commands - ticks.command
+    if setting.rounded:
+        left = left - find_offset(linear, ticks, log, left)
     return Match(
         commands=commands,
         allowed=allowed,
-        error=commands - ticks.command,
+        error=left,
         integrals=count_integrals(linear),
         allowed_within=allowed_within,
     )
@@ -364,6 +367,18 @@ def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, "
     left, weight = ticks.command - follow(law, ticks, limited), 1.0 / allowed[~limited]
     modes = find_modes(law, limited)[~limited] * weight[:, None]
     return np.linalg.lstsq(modes, left[~limited] * weight, rcond=1e-10)[0]
+
+
+def find_offset(law: RunnableLaw, ticks: Ticks, log: Ticks, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return what a law's integrals make of the mean of a reference's rounding, as an error has it: where the reference
+    repeats it is the same in each period. It is no more than half a step.
+    """
+    step = find_quantisation(log.reference) if is_rounded(log.reference) else 0.0
+    if not step or not count_integrals(law) or np.any(find_at_limit(ticks, law)):
+        return np.zeros(len(ticks))
+    impulse = np.concatenate([[law.d_reference], list_powers(law.c, law.a, len(ticks) - 1) @ law.b_reference])
+    steady = law.per_effort * np.cumsum(impulse)
+    return float(np.clip(steady @ error / (steady @ steady), -0.5 * step, 0.5 * step)) * steady
 
 
 def is_rounded(reference: Float[np.ndarray, " n"]) -> bool:

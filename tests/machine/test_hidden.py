@@ -123,3 +123,19 @@ def test_counts_that_hide_the_noise_tell_nothing(knee, benches):
     ticks = take_ticks(law, record(benches["law"], machine, 1, decimals=0, noise=0.01))
     setting = make_setting(law, ticks)
     assert find_hidden(setting, play(setting), {}) == ()
+
+
+@pytest.mark.parametrize("decimals", [2, 3])
+def test_the_mean_of_a_references_rounding_that_repeats_is_not_another_law(knee, benches, decimals):
+    """Over sixty periods it runs up in two integrals to many times what rounding makes at random."""
+    law, machine = knee
+    periodic = multisine(1000, LINES, 60, 1.0, 1)
+    met = {}
+    for name in ("law", "weak"):
+        log = benches[name].log(machine, periodic, noise=0.02, seed=1, decimals=4)
+        columns = {"reference": np.round(log["reference"], decimals), "I": log["I"], "tau_s": log["tau_s"]}
+        (row,) = so.accept(law, [so.Log.from_arrays(time=log.time, **columns)]).replays
+        met[name] = row.met
+        causes = [(cause.kind, cause.what) for cause in row.causes[:1]]
+        assert not causes if name == "law" else causes == [("gain", "k_p")], (name, row)
+    assert met == {"law": True, "weak": False}
