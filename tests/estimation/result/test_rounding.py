@@ -36,8 +36,8 @@ def test_under_noise_of_half_a_step_nothing_is_left_of_it():
     assert Rounding.of(0.0, 0.1, 1) is None
 
 
-def fit_encoder(seed, steps):
-    """Return a fit of a held joint's motor angle, in so many steps over its swing."""
+def fit_encoder(seed, steps, noise=0.0):
+    """Return a fit of a held joint's motor angle, in so many steps over its swing, with noise of so many before it."""
     rng, t = np.random.default_rng(seed), np.arange(round(10.0 * RATE_HZ)) / RATE_HZ
     current = chirp(t, 0.1, 10.0, 30.0, phi=rng.uniform(0, 360)) * rng.uniform(0.8, 1.2)
     J_m, b_r, k_s = TRUTH.values()
@@ -45,7 +45,8 @@ def fit_encoder(seed, steps):
     held = cont2discrete((a, np.array([[0.0], [K_TAU / J_m]]), np.eye(2), np.zeros((2, 1))), 1.0 / RATE_HZ)
     angle = dlsim((*held[:2], np.array([[1.0, 0.0]]), np.zeros((1, 1)), 1.0 / RATE_HZ), current)[1][:, 0]
     step = 2.0 * np.max(np.abs(angle)) / steps
-    log = so.Log.from_arrays(time=t, I=current, theta_m=np.round((angle + rng.uniform(0, step)) / step) * step)
+    read = angle + rng.uniform(0, step) + noise * step * rng.normal(size=t.size)
+    log = so.Log.from_arrays(time=t, I=current, theta_m=np.round(read / step) * step)
     plant = so.plants.rotary(link="locked")
     known = plant.defaults.update(K_tau=K_TAU, N=N, c_s=0.0, f_c=0.0)
     start = known.update(**{name: 1.2 * value for name, value in TRUTH.items()}).free(*TRUTH)
@@ -63,6 +64,16 @@ def test_ten_steps_of_an_encoder_leave_intervals_that_hold():
         assert np.sqrt(np.mean(of_noise**2)) > 2.0
         assert 0.5 < np.sqrt(np.mean(z**2)) < 1.4
         assert np.all(np.abs(z) < 2.5)
+
+
+def test_noise_of_a_tenth_of_a_step_leaves_intervals_that_hold():
+    """It does not make rounding white: the errors of 40 steps of swing are uniform ones, and follow the motion."""
+    fits = [fit_encoder(seed, 40, 0.1) for seed in range(10)]
+    assert all(fit.met for fit in fits)
+    off = np.array([[fit.parameters[name].value / TRUTH[name] - 1.0 for name in TRUTH] for fit in fits])
+    z = off / [[fit.parameters[name].total_std / TRUTH[name] for name in TRUTH] for fit in fits]
+    assert np.count_nonzero(np.abs(z) < 1.96) >= 27  # of 30
+    assert np.all(np.sqrt(np.mean(z**2, axis=0)) > 0.4)  # nor much too wide
 
 
 def test_a_fine_encoder_s_intervals_stay_as_they_were():
