@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
-from seaopt.control import Controller, SampledLoop, run_loop, runnable
-from seaopt.control.loops.sampled_plant import find_delay, read_conditions
+from seaopt.control import Controller, run_loop, runnable
 from seaopt.control.running.closed_loop import LoopRun
 from seaopt.parameters import ParameterSet
+from seaopt.robustness.verification.scenarios import build_loop
 
 RTOL = 1e-4  # of the integration: a hundredth of what a disc tells
 
@@ -32,14 +32,7 @@ def run_design(
     """
     assert controller.design is not None
     seen, values = controller.see(controller.design[0]), [controller.delay(each) for each in sets]
-    longest = max(float(find_delay(seen, read_conditions(seen, seen.complete(each)))) for each in values)
     law = runnable(controller, gate=False, heat=False)
-    loop = SampledLoop(
-        plant=seen,
-        law=replace(law, sample_time_s=law.sample_time_s / rate),
-        measured=controller.signals,
-        delay_samples=controller.compute_delay_samples,
-        longest_delay_s=longest,
-        sensors=sensors or Sensors(),
-    )
+    slowed = replace(law, sample_time_s=law.sample_time_s / rate)
+    loop = build_loop(controller, seen, [seen.complete(each) for each in values], slowed, sensors=sensors or Sensors())
     return run_loop(loop, values, reference, rtol=RTOL, seed=seed)

@@ -161,7 +161,7 @@ class SampledLoop:
 
 def find_longest_delay(plant: Plant, params: Iterable[ParameterSet]) -> float:
     """Return the longest delay, s, among the conditions of several runs' parameters."""
-    return max(float(find_delay(plant, read_conditions(plant, each))) for each in params)
+    return max((float(find_delay(plant, read_conditions(plant, each))) for each in params), default=0.0)
 
 
 def channel_names(plant: Plant) -> tuple[str, ...]:

@@ -139,7 +139,7 @@ def large_signal(
     if not linear.figures().stable:
         raise ControlError(f"the linear loop on {plant.name} is unstable, so that no response settles; tune another")
     # A gate gives its sensor up at the largest amplitudes, where there is no response then.
-    loop = build_loop(controller, plant, parameters, runnable(controller, gate=False))
+    loop = build_loop(controller, plant, [parameters], runnable(controller, gate=False))
     loop = replace(loop, sticks=plant.sticks)  # a smoothed curve would let the motor creep
     if frequencies_hz is None:
         wanted = np.geomspace(band / (SLOWEST_STUCK if friction else 5.0), 2 * band, SWEEP_POINTS)

@@ -114,7 +114,7 @@ def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle:
     values = plant.complete(controller.delay(params)).drop_conditions()
     try:
         # A gate that gives its sensor up ends a cycle, which would pass for one that does not last.
-        loop = build_loop(controller, plant, values, runnable(controller, gate=False, outer=True))
+        loop = build_loop(controller, plant, [values], runnable(controller, gate=False, outer=True))
         start = at_rest(loop, 1, PUSH * np.array(cycle.state))
         run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
     except SimulationError as error:

@@ -25,7 +25,7 @@ from seaopt.plants.plant import fill_vector, output_function
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
 from seaopt.robustness.verification.oscillation import Signal
-from seaopt.robustness.verification.scenarios import Phase, Scenario
+from seaopt.robustness.verification.scenarios import Phase, Scenario, build_loop
 
 RunSamples = Float[np.ndarray, "runs n"]
 
@@ -47,17 +47,9 @@ class Stage:
             raise ControlError(
                 f"a phase holds the link of {self.plant.name}; give partner, the plant with that link fixed"
             )
-        return SampledLoop(
-            plant=plant,
-            law=self.law,
-            measured=self.controller.signals,
-            delay_samples=self.controller.compute_delay_samples,
-            sensors=self.sensors,
-            command_step=self.command_step,
-            longest_delay_s=longest_delay_s,
-            sticks=sticks and can_stick(plant),  # bristles hold by themselves
-            link=None if self.controller.link is None else self.controller.link.measured,
-        )
+        devices = {"sensors": self.sensors, "command_step": self.command_step, "longest_delay_s": longest_delay_s}
+        sticks = sticks and can_stick(plant)  # bristles hold by themselves
+        return build_loop(self.controller, plant, (), self.law, sticks=sticks, **devices)
 
     @property
     def law(self) -> RunnableLaw:

@@ -16,6 +16,7 @@ from seaopt.control.laws.outer_run import close, enclose
 from seaopt.control.laws.realisation import RunnableLaw, runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.control.running.sampled_loop import find_longest_delay
+from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.errors import ControlError, suggestion
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -349,7 +350,9 @@ def find_step_limit(controller: Controller) -> float | None:
     sliding = take_sliding(plant, params)
     if not controller.close(sliding, params).is_stable():
         return controller.force_limit(0.0)
-    loop = build_loop(controller, sliding, params, runnable(controller, command_limit=math.inf, gate=False, heat=False))
+    loop = build_loop(
+        controller, sliding, [params], runnable(controller, command_limit=math.inf, gate=False, heat=False)
+    )
     tried = NOMINAL_EFFORT[controller.command.mechanics]
     run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), tried))
     step, held = tried * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.0)
@@ -358,15 +361,23 @@ def find_step_limit(controller: Controller) -> float | None:
 
 
 def build_loop(
-    controller: Controller, plant: Plant, params: ParameterSet, law: RunnableLaw | None = None
+    controller: Controller,
+    plant: Plant,
+    params: Sequence[ParameterSet],
+    law: RunnableLaw | RunnableSchedule | None = None,
+    **devices: Any,
 ) -> SampledLoop:
-    """Return a controller's loop on a nonlinear plant, with ideal devices; `law` runs in place of its own."""
+    """Return a controller's loop on a nonlinear plant, with ideal devices but for those given, as `SampledLoop` has
+    them; `law` runs in place of its own, and a schedule's in that of its laws.
+    """
+    more: dict[str, Any] = {"longest_delay_s": find_longest_delay(plant, params), **devices}
     return SampledLoop(
         plant=plant,
         law=law or runnable(controller, outer=True),
         measured=controller.signals,
         delay_samples=controller.compute_delay_samples,
-        longest_delay_s=find_longest_delay(plant, [params]),
+        link=None if controller.link is None else controller.link.measured,
+        **more,
     )
 
 
@@ -387,7 +398,7 @@ def _size_blow(controller: Controller, plant: Plant, force: float) -> float:
     link = _struck(plant)
     assert link is not None
     params = plant.complete(_require_design(controller)[1]).drop_conditions()
-    loop = build_loop(controller, plant, params)
+    loop = build_loop(controller, plant, [params])
 
     def measure_peak(blow: float) -> float:
         state = strike(plant, params, np.zeros(len(plant.states)), link, blow)

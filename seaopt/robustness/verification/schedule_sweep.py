@@ -34,10 +34,9 @@ from seaopt.codec import OrInfinite
 from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import find_rest
-from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, run_loop
+from seaopt.control.running.closed_loop import LoopRun, LoopState, run_loop
 from seaopt.control.running.law_step import find_faults, list_kept
 from seaopt.control.running.loop_kernel import Rows
-from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
 from seaopt.errors import SimulationError
@@ -50,7 +49,7 @@ from seaopt.progress import Progress, ignore
 from seaopt.records import record
 from seaopt.robustness.verification.judgement import Judge, find_saturated, take_ends
 from seaopt.robustness.verification.oscillation import Signal
-from seaopt.robustness.verification.scenarios import PEAK_GRACE, SETTLED
+from seaopt.robustness.verification.scenarios import PEAK_GRACE, SETTLED, build_loop
 from seaopt.units import show_command
 
 SHARES = tuple(2.0**power for power in range(-7, 0))  # of the least bandwidth: frequencies of the sweeps
@@ -266,14 +265,7 @@ class RestStart:
                 f"{needed} holds it at {self.schedule.over} = {self.value:.4g}, above the limit of {limit}"
             )
         fed = np.array([self.readings[name] for name in self.schedule.controllers[0].signals])
-        loop = SampledLoop(
-            plant=plant,
-            law=law,
-            measured=self.schedule.controllers[0].signals,
-            delay_samples=self.schedule.spec.loop_delay_samples,
-            longest_delay_s=find_longest_delay(plant, [values]),
-            place=self.schedule.over,
-        )
+        loop = build_loop(self.schedule.controllers[0], plant, [values], law, place=self.schedule.over)
         named = {self.schedule.over: value} | self.readings
         further = [named.get(name, 0.0) for name in law.further]
         reference = float(fed[0]) - _weigh(law, named, value)
