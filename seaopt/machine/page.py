@@ -17,7 +17,7 @@ from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import LEAST_PHASES, SHORT_BY, Judged, Measured, Response
 from seaopt.machine.ticks import AT_LIMIT, Gaps
-from seaopt.machine.wording import say_cause, say_difference, say_missing, say_trip
+from seaopt.machine.wording import say_bias, say_cause, say_difference, say_missing, say_trip
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -332,6 +332,9 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
         unit = unit_after(result.controller.command.effort_unit)
         sizes = (f"{format_number(value, 3)}{unit}" for value in (response.effort, response.friction))
         remarks.insert(0, STILL.format(*sizes))
+    biases = [bias for part in response.measured if (bias := part.find_bias(1.0 - response.confidence)) is not None]
+    if biases:
+        remarks.append(say_bias(max(biases, key=lambda each: each.largest)))
     if response.at_amplitude_only:
         remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
     if any(row.outcome == "undecided" for row in response.judged if row.limit is not None):

@@ -10,6 +10,7 @@ from seaopt.machine.causes import Cause
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.free_gains import SAME_GAINS
+from seaopt.machine.response.judged import Bias
 from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band
 from seaopt.machine.response.tripped import Trip
 from seaopt.units import unit_after
@@ -116,6 +117,15 @@ def say_trip(controller: Controller, trip: Trip) -> str:
         f"the gate tripped at {trip.at_s:.3f} s, of {trip.readings} readings in a row {why} (the last "
         f"{format_number(trip.reading)}{unit}), and the law was stopped for the rest, {trip.stopped_s:.4g} s: look at "
         "the sensor and its cable, or at the gate where the readings are true"
+    )
+
+
+def say_bias(bias: Bias) -> str:
+    """Return how far off the plant would be without the reference."""
+    most, where = format_number(100.0 * bias.largest, 2), format_number(bias.where_hz, 3)
+    return (
+        f"Taken from command and readings alone, the plant would be off by up to {most} % (at {where} Hz), as noise "
+        "goes round the loop; here all is taken from the reference."
     )
 
 

@@ -36,6 +36,15 @@ class Judged:
     near: float | None = None  # where those periods last over an hour: the estimate's distance from the limit, relative
 
 
+@record
+class Bias:
+    """Where the plant from command and readings alone is shown to be off, and by how much."""
+
+    lines: int
+    largest: float  # of the plant's size
+    where_hz: float  # of the largest
+
+
 @record(eq=False)
 class Measured:
     """The response at one amplitude."""
@@ -49,6 +58,23 @@ class Measured:
     phases: int
     amplitude: float
     left_out: LeftOut
+    direct: Complex[np.ndarray, " m"]  # the plant from command and readings alone, without the reference
+
+    @property
+    def plant(self) -> Ratio:
+        """Of the regulated output."""
+        return next(iter(self.outputs.values()))
+
+    def find_bias(self, alpha: float) -> Bias | None:
+        """Return where the direct estimate lies outside of the plant's discs, which `alpha` shares; None where it does
+        at no line.
+        """
+        centre, radius = self.plant.disc(alpha / self.f.size)
+        off = np.where(np.abs(self.direct - centre) > radius, np.abs(self.direct / centre - 1.0), 0.0)
+        at = int(np.argmax(off))
+        if not off[at]:
+            return None
+        return Bias(lines=int(np.count_nonzero(off)), largest=float(off[at]), where_hz=float(self.f[at]))
 
     @property
     def distance(self) -> Complex[np.ndarray, " m"]:

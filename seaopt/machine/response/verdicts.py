@@ -2,7 +2,10 @@ r"""The loop's response from periods of a log, and which of its limits the log c
 
 The reference R is known without error, so that everything is taken from it, jointly (the joint input-output method):
 U/R and what the law makes of the readings, :math:`V/R = \sum_i C_i Y_i/R`. Then :math:`\hat L = \bar V/\bar U` at each
-line, however the noise goes round the loop; U over Y alone tends to -1/C with noise. The tracking is Y/R itself.
+line, however the noise goes round the loop. The tracking is Y/R itself. From U and Y alone, the direct estimate
+:math:`\sum \bar U_p Y_p / \sum |U_p|^2` tends to a mean of the plant and of -1/C, with the shares of U that the
+reference and the noise make (Forssell and Ljung, Automatica 35, 1999); it stands beside the plant, to show what noise
+does.
 
 With :math:`\hat L` of std s and the limit :math:`M_s`, at a risk :math:`\alpha` of a false statement:
 
@@ -107,7 +110,7 @@ class Response(AgainstFriction):
 
 
 def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
-    radius = part.loop.disc(alpha)[1]
+    loop_radius, plant_radius = (ratio.disc(alpha)[1] for ratio in (part.loop, part.plant))
     return {
         "amplitude": part.amplitude,
         "periods": part.periods,
@@ -118,7 +121,13 @@ def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
         "frequency_hz": part.f,
         "loop_re": np.real(part.loop.value),
         "loop_im": np.imag(part.loop.value),
-        "loop_radius": np.where(np.isfinite(radius), radius, -1.0),
+        "loop_radius": np.where(np.isfinite(loop_radius), loop_radius, -1.0),
+        "plant_re": np.real(part.plant.value),
+        "plant_im": np.imag(part.plant.value),
+        "plant_radius": np.where(np.isfinite(plant_radius), plant_radius, -1.0),
+        "direct_re": np.real(part.direct),
+        "direct_im": np.imag(part.direct),
+        "direct_bias": part.find_bias(alpha),
         "tracking_re": np.real(part.tracking.value),
         "tracking_im": np.imag(part.tracking.value),
         "tracking_radius": part.tracking.disc(alpha)[1],
@@ -127,10 +136,12 @@ def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
 
 def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured:
     """Return the response of periods of one amplitude; `by_phases`: of means over the periods of each set of phases."""
-    rows = blocks.average() if by_phases else blocks
     responses = controller.law.responses(blocks.f)
+    if has_terms(controller):
+        blocks = replace(blocks, effort=blocks.make_efforts(responses))
+    rows = blocks.average() if by_phases else blocks
     feedback = -responses[1:]
-    effort = (rows.make_efforts(responses) if has_terms(controller) else rows.effort) / rows.reference
+    effort = rows.effort / rows.reference
     measured = rows.measured / rows.reference[:, None, :]
     returned = np.sum(feedback * measured, axis=1)
     outputs = dict(zip(controller.signals, measured.swapaxes(0, 1), strict=True))
@@ -145,6 +156,8 @@ def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured
         phases=blocks.realisations,
         amplitude=blocks.amplitude,
         left_out=blocks.left_out,
+        direct=np.sum(np.conj(blocks.effort) * blocks.measured[:, 0], axis=0)
+        / np.sum(np.abs(blocks.effort) ** 2, axis=0),
     )
 
 
@@ -266,7 +279,7 @@ def _is_same_gain(measured: Sequence[Measured]) -> bool:
     """Tell whether two amplitudes have the same gain at every line."""
     if len(measured) < 2 or any(part.f.size != measured[0].f.size for part in measured):
         return False
-    gains = [np.abs(next(iter(part.outputs.values())).value) for part in measured]
+    gains = [np.abs(part.plant.value) for part in measured]
     return all(bool(np.all(np.abs(gain / gains[0] - 1.0) < SAME_GAIN)) for gain in gains[1:])
 
 
