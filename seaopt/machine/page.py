@@ -15,7 +15,7 @@ from seaopt.machine.figures import list_panels
 from seaopt.machine.free_gains import read_gains
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
-from seaopt.machine.response.verdicts import LEAST_PHASES, SHORT_BY, Judged, Measured, Response
+from seaopt.machine.response.verdicts import LEAST_PHASES, SHORT_BY, Judged, Measured, Response, compares_amplitudes
 from seaopt.machine.ticks import AT_LIMIT, Gaps
 from seaopt.machine.wording import say_bias, say_cause, say_difference, say_missing, say_trip
 from seaopt.reporting.page.chart import make_chart
@@ -91,6 +91,11 @@ WORTH = (
     " The limit of {} is {} of what was asked: it tells a loop that runs from one that does not, and says little of "
     "its speed."
 )
+ONE_AMPLITUDE = (
+    "With dry friction this holds at the amplitude of the log only: play one of twice or half of it as well, with the "
+    "same lines."
+)
+EACH_AMPLITUDE = "With dry friction this holds at these amplitudes only: the gain is another one at each."
 SHORT = "; a larger reference comes nearer to what was asked"
 STABILITY = (
     "Stability is the least |1 + L| over the radius of its disc (no unit): above 1 no disc holds zero, where the loop "
@@ -336,7 +341,7 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     if biases:
         remarks.append(say_bias(max(biases, key=lambda each: each.largest)))
     if response.at_amplitude_only:
-        remarks.append("With dry friction this holds at the amplitude of the log only: play a second one as well.")
+        remarks.append(EACH_AMPLITUDE if compares_amplitudes(response.measured) else ONE_AMPLITUDE)
     if any(row.outcome == "undecided" for row in response.judged if row.limit is not None):
         remarks.append(
             f"Undecided is no doubt about the machine: the log does not decide {_say_undecided(result, response)}."

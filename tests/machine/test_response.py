@@ -353,6 +353,35 @@ def test_with_dry_friction_fewer_than_six_sets_of_phases_confirm_nothing(dry):
     )
 
 
+@pytest.mark.parametrize(
+    ("friction", "second", "says"),
+    [
+        (FRICTION, 0.85, "holds at the amplitude of the log only: play one of twice or half"),  # gains agree to 3 %
+        (FRICTION, 0.4, "holds at these amplitudes only"),
+        (0.05 * FRICTION, 0.5, None),
+    ],
+)
+def test_two_amplitudes_that_are_apart_tell_whether_friction_makes_another_machine_of_each(dry, friction, second, says):
+    bench, reference = dry
+    machine = replace(Machine(), coulomb=friction, smoothing=5e-3)
+    logs = [bench.log(machine, scale * reference, noise=0.5) for scale in (1.0, second)]
+    # without noise, by the sums of the last periods of all sets of phases: force over command, as both per reference
+    period, gains = find_period(reference), list[np.ndarray]()
+    lines = np.round(cut_periods(bench.controller, take_ticks(bench.controller, logs[0])).f * period * 1e-3).astype(int)
+    for scale in (1.0, second):
+        log = bench.log(machine, scale * reference, noise=0.0)
+        played, force, current = (
+            np.fft.rfft(log[name].reshape(-1, period)[3::4])[:, lines] for name in ("reference", "F1", "I")
+        )
+        gains.append(np.abs(np.sum(force / played, axis=0) / np.sum(current / played, axis=0)))
+    same = bool(np.all(np.abs(gains[1] / gains[0] - 1.0) < 0.1))
+    result = so.accept(bench.controller, logs)
+    assert result.response.at_amplitude_only == (says is not None)
+    assert same == (friction < FRICTION or second > 0.8)
+    said = " ".join(repr(result).split())
+    assert says in said if says else "amplitude of the log only" not in said and "amplitudes only" not in said
+
+
 def test_turns_of_a_loop_that_friction_holds_are_counted_beside_the_stuck_plant(compiler, tmp_path):
     """A slow stage of a knee hardly slides: its machine comes to rest, its loop is nowhere near the sliding one."""
     plant = so.plants.rotary(link="locked")

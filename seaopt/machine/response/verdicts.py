@@ -48,7 +48,9 @@ from seaopt.records import record
 
 LEAST_PHASES = 6  # sets of phases, with dry friction
 SAME_GAIN = 0.1  # relative, between two amplitudes
+APART = 1.8  # of two amplitudes, about twice: what friction changes falls as one over the amplitude, and shows by half
 GRACE = 0.05  # of each limit: a machine is not its model to the last digit
+SAME_LINE = 1e-3  # relative
 SHORT_BY = 0.1  # of the bandwidth
 CENTRE = 1.0 - 1e-9  # a risk at which discs are points
 MOST_PERIODS = 1e6  # that are counted
@@ -276,11 +278,18 @@ def _tell_near(row: Judged, period_s: float) -> Judged:
 
 
 def _is_same_gain(measured: Sequence[Measured]) -> bool:
-    """Tell whether two amplitudes have the same gain at every line."""
-    if len(measured) < 2 or any(part.f.size != measured[0].f.size for part in measured):
+    """Tell whether amplitudes that are apart have the same gain at every line."""
+    if not compares_amplitudes(measured):
         return False
     gains = [np.abs(part.plant.value) for part in measured]
     return all(bool(np.all(np.abs(gain / gains[0] - 1.0) < SAME_GAIN)) for gain in gains[1:])
+
+
+def compares_amplitudes(measured: Sequence[Measured]) -> bool:
+    """Tell whether amplitudes were played that are apart, at the same lines."""
+    first, sizes = measured[0], [part.amplitude for part in measured]
+    alike = all(part.f.size == first.f.size and np.allclose(part.f, first.f, rtol=SAME_LINE) for part in measured)
+    return alike and max(sizes) >= APART * min(sizes)
 
 
 def _judge_stability(controller: Controller, measured: Sequence[Measured], alpha: float) -> Judged:
