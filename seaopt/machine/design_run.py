@@ -32,7 +32,7 @@ def run_design(
     """
     assert controller.design is not None
     seen, values = controller.see(controller.design[0]), [controller.delay(each) for each in sets]
-    law = runnable(controller, gate=False, heat=False)
+    law = runnable(controller, gate=False, heat=False, outer=controller.outer is not None)
     slowed = replace(law, sample_time_s=law.sample_time_s / rate)
     loop = build_loop(controller, seen, [seen.complete(each) for each in values], slowed, sensors=sensors or Sensors())
     return run_loop(loop, values, reference, rtol=RTOL, seed=seed)

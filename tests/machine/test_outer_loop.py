@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.linalg
 
 import seaopt as so
 from seaopt.control import Impedance, add_impedance
+from seaopt.machine.design_run import run_design
 from tests.machine.simulator import multisine
 
 T = 1e-3
@@ -175,6 +178,17 @@ def take_link():
 LINES = np.unique(np.round(np.geomspace(2, 120, 20)).astype(int))
 
 
+class Quiet:
+    """No noise."""
+
+    def normal(self):
+        return 0.0
+
+
+def excite_quietly():
+    return 0.05 * np.sin(2.0 * np.pi * 3.0 * T * np.arange(2000)) * np.minimum(1.0, np.arange(2000) / 500.0)
+
+
 def excite(stiffness, seed):
     return multisine(2000, LINES, 8, 0.1 if stiffness else 2.0, seed)
 
@@ -210,6 +224,16 @@ def test_the_whole_loop_of_a_right_machine_is_met_and_is_its_margin_at_the_comma
     loop = -law.per_effort * (inner[:, 1] * torque + inner[:, 0] * outer) / z  # a command waits for the next tick
     assert figures["Ms"].value == pytest.approx(np.max(1.0 / np.abs(1.0 + loop)), rel=0.02)
     assert figures["Ms"].predicted == pytest.approx(np.max(1.0 / np.abs(1.0 + loop)), rel=1e-3)
+
+
+def test_what_is_simulated_has_the_outer_loop(impedance, monkeypatch):
+    """On the test's own machine: drives with a limit, and dry friction, are told by simulating law and outer loop."""
+    monkeypatch.setattr(np.random, "default_rng", lambda seed: Quiet())
+    goal = excite_quietly()
+    rows = run(impedance, goal)
+    simulated = run_design(replace(impedance, design=take_link()), [take_link()[1]], goal)
+    np.testing.assert_allclose(simulated.outputs["tau_s"][0], rows[:, 2], atol=2e-3 * np.ptp(rows[:, 2]))
+    np.testing.assert_allclose(simulated.outputs["theta_l"][0], rows[:, 3], atol=2e-3 * np.ptp(rows[:, 3]))
 
 
 def test_what_differs_under_a_running_impedance_is_named(impedance, monkeypatch):

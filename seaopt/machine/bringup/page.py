@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.control import Controller, ForceMPC, ScheduledController
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup.stages import Band, BringUp, Stage
 from seaopt.machine.response.verdicts import find_friction, has_dry_friction
@@ -18,7 +19,7 @@ from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
 from seaopt.reporting.sections.kinds.controller import explain_sliding, say_bandwidths, show_stuck_bandwidth
-from seaopt.units import unit_after
+from seaopt.units import mechanics_of, unit_after
 
 PARTS = {"stages": "Stages", "provenance": "Provenance"}
 ALWAYS = (
@@ -67,7 +68,10 @@ OUTER = (
     "These stages are of the force law alone: leave the outer loop out, with the link as in the design plant, and give "
     "the law the reference itself. Close the outer loop after the last stage, and log {}"
 )
-PLACE = "its x_0 as the reference, with the link's position: seaopt accept replays both."
+PLACE = (
+    "its x_0 as the reference, with the link's position: seaopt accept replays both, and judges the loop with the "
+    "outer loop in it. Let x_0 move by the last stage's reference over the stiffness, {}."
+)
 FORCE = "what step was given as the reference; or, with the link's position, the force that the damping is added to."
 
 
@@ -83,12 +87,18 @@ def summarise(result: BringUp) -> list[KeyFigure]:
     ]
 
 
+def _say_logged(controller: Controller, outer: OuterLoop) -> str:
+    """Return what to log, and to play, with an outer loop closed."""
+    unit = mechanics_of(outer.place_unit).stiffness
+    return PLACE.format(f"{outer.stiffness:.4g} {unit}") if controller.renders else FORCE
+
+
 def describe(result: BringUp) -> list[Section]:
     """Return a table of the stages, then each with what to play, to log, to expect, and when to stop."""
     rows = tuple(_list_row(stage) for stage in result.stages)
     head = ("stage", "law", "bandwidth (Hz)", "stuck (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
     last = result.stages[-1].controller
-    outer = () if last.outer is None else (OUTER.format(PLACE if last.renders else FORCE),)
+    outer = () if last.outer is None else (OUTER.format(_say_logged(last, last.outer)),)
     still = [stage.name for stage in result.stages if stage.still]
     held = (HELD.format(join_words(still)),) if still else ()
     overview = Section(
