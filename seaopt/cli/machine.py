@@ -38,7 +38,7 @@ from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
 from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.robustness import Certificate, JointTuning, linear_controller
-from seaopt.signals import REFERENCE
+from seaopt.signals import REFERENCE, STATUS
 
 FILE, PAGE = "acceptance.json", "acceptance.html"
 BRING_UP, PLAN = "bringup", "bringup.json"  # the folder of the stages, and what they are
@@ -86,6 +86,7 @@ def accept_logs(
     units = _list_units(controller)
     if isinstance(source, ScheduledController):
         units[source.over] = source.unit
+    units[STATUS] = "-"
     link = None
     if source.outer is not None and source.outer.plant in session.problem.plants:
         link = session.problem.plants[source.outer.plant], session.values()

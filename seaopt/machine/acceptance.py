@@ -25,6 +25,7 @@ from seaopt.machine.differences.certified import Differences, compare
 from seaopt.machine.differences.rate_of_commands import find_rate
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
+from seaopt.machine.reported import Reported, read_status
 from seaopt.machine.response.enclosed import enclose_outer, enclose_ticks
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
 from seaopt.machine.response.tripped import Trip, find_refused, find_trip
@@ -77,6 +78,8 @@ class Acceptance(Result, Worded):
         Of a schedule its variable, where that stood, and its unit.
     gaps : tuple of Gaps or None
         Of each log, what it lacks.
+    reported : tuple of Reported or None
+        Of each log, what its own channel `status` says of the law.
     stepped : Difference or None
         The rate at which the law is stepped, where no log has a response and what the machine made of the commands
         tells that it is another than that of the log's clock.
@@ -96,6 +99,7 @@ class Acceptance(Result, Worded):
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
     place: tuple[str, float, str] | None = None
     gaps: tuple[Gaps | None, ...] = ()
+    reported: tuple[Reported | None, ...] = ()
     stepped: Difference | None = None
     experiments: tuple[Log, ...] = ()
     enclosed: bool = False
@@ -118,8 +122,11 @@ class Acceptance(Result, Worded):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of acceptance.json (schema seaopt/acceptance/1)."""
-        parts = zip(self.sources, self.replays, self.gaps, strict=True)
-        logs = [{"log": source} | to_content(row) | {"gaps": to_content(gaps)} for source, row, gaps in parts]
+        parts = zip(self.sources, self.replays, self.gaps, self.reported, strict=True)
+        logs = [
+            {"log": source} | to_content(row) | {"gaps": to_content(gaps), "status": to_content(reported)}
+            for source, row, gaps, reported in parts
+        ]
         content = {
             "schema": ACCEPTANCE_SCHEMA,
             "met": self.met,
@@ -273,6 +280,7 @@ def accept(
         controller=law,
         sources=sources,
         replays=tuple(replays),
+        reported=tuple(read_status(log, row) for log, row in zip(logs, replays, strict=True)),
         place=place,
         gaps=tuple(ticks.gaps for ticks in rows),
         experiments=experiments,

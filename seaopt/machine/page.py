@@ -17,7 +17,7 @@ from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import LEAST_PHASES, SHORT_BY, Judged, Measured, Response, compares_amplitudes
 from seaopt.machine.ticks import AT_LIMIT, Gaps
-from seaopt.machine.wording import say_bias, say_cause, say_difference, say_missing, say_trip
+from seaopt.machine.wording import say_bias, say_cause, say_difference, say_missing, say_status, say_trip
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -134,6 +134,10 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     reasons += [Reason(what=say_trip(result.controller, row.trip), where=source) for source, row in trips if row.trip]
     count = format_count(len(result.sources), "log")
     parts = [f"the law makes the logged command in {len(result.sources) - len(off)} of {count}"]
+    reported = zip(result.sources, result.reported, result.replays, strict=True)
+    reasons += [
+        Reason(what=say_status(each, row), where=source) for source, each, row in reported if each and each.contradicts
+    ]
     response, differences = result.response, result.differences
     if response is not None:
         limited = [row for row in response.judged if row.limit is not None]
@@ -454,6 +458,11 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         "and of the log for a fit."
         for source, row in zip(result.sources, result.replays, strict=True)
         if row.trip
+    )
+    remarks += tuple(
+        f"By {Path(source).name} {said}."
+        for source, reported, row in zip(result.sources, result.reported, result.replays, strict=True)
+        if reported is not None and (said := say_status(reported, row))
     )
     remarks += tuple(
         f"{Path(source).name} does not exclude that {', or that '.join(map(say_cause, row.possible))}."

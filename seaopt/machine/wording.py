@@ -10,6 +10,8 @@ from seaopt.machine.causes import Cause
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.free_gains import SAME_GAINS
+from seaopt.machine.replay import Replay
+from seaopt.machine.reported import Reported
 from seaopt.machine.response.judged import Bias
 from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band
 from seaopt.machine.response.tripped import Trip
@@ -118,6 +120,17 @@ def say_trip(controller: Controller, trip: Trip) -> str:
         f"{format_number(trip.reading)}{unit}), and the law was stopped for the rest, {trip.stopped_s:.4g} s: look at "
         "the sensor and its cable, or at the gate where the readings are true"
     )
+
+
+def say_status(reported: Reported, row: Replay) -> str:
+    """Return what the machine's own status says of a law that was stopped; nothing where it was not, by both."""
+    fault = "" if reported.fault_s is None else f"its status is a fault from {reported.fault_s:.3f} s on"
+    if reported.contradicts and fault:
+        return f"{fault}, but the logged command is that of the law to the end; look at which status is logged"
+    if reported.contradicts:
+        return "its status has no fault, though the gate tripped by its readings; look at which status is logged"
+    stopped = any(cause.kind == "stopped" for cause in row.causes)
+    return fault or ("its status has no fault: a stage ended itself, or a hand stopped it" if stopped else "")
 
 
 def say_bias(bias: Bias) -> str:

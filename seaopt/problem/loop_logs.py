@@ -17,9 +17,10 @@ from seaopt.logs.reading.selection import ClockError
 from seaopt.problem.bench_tables import ExperimentTable
 from seaopt.problem.columns import make_column
 from seaopt.problem.problem import Problem
-from seaopt.signals import REFERENCE, REFERENCES, Table, VectorN
+from seaopt.signals import REFERENCE, REFERENCES, STATUS, Table, VectorN
 from seaopt.units import bare_name
 
+NUMBERS = ("float", "int", "uint")  # kinds of a column, before their bits
 MOST_NAMES = 20  # in a message
 SAME_STAMP = 1e-6  # of a period, by which rows of one stamp are set apart
 OFF_RATE = 5e-3  # of the rows: as far as a clock is off
@@ -48,6 +49,8 @@ def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], refere
         if column is None:
             continue  # who judges the log says what it is for
         field = fields.get(column.column) if isinstance(column.column, str) else None
+        if name == STATUS and (field is None or field.kind.rstrip("0123456789") not in NUMBERS):
+            continue  # words of another kind
         has_none = column.unit is None and field is not None and field.unit is None
         channels[name] = replace(column, unit=unit or "-") if has_none else column
     if not channels:

@@ -103,6 +103,25 @@ def test_columns_without_units_and_with_other_names_are_read(folder, accept):
     assert wrong.exit_code != 0 and "--reference COLUMN" in str(wrong.exception)
 
 
+@pytest.mark.parametrize(
+    ("ok", "fault", "told"),
+    [
+        ("0", "0", {"held": 0, "fault_s": None, "contradicts": False}),
+        ("0", "2", {"held": 0, "fault_s": 4.0, "contradicts": True}),
+        ("fine", "bad", None),
+        ("17", "23", None),
+    ],
+)
+def test_a_column_of_the_law_s_status_is_read_and_one_of_another_status_is_let_be(folder, accept, ok, fault, told):
+    header, *rows = (folder / "good.csv").read_text().splitlines()
+    lines = [f"{row},{ok if k < 4000 else fault}" for k, row in enumerate(rows)]
+    (folder / "status.csv").write_text("\n".join([f"{header},status", *lines]) + "\n")
+    done = accept(folder / "status.csv")
+    assert done.exit_code == 0 and "is constant" not in done.output, done.output
+    assert json.loads((folder / "out" / "acceptance.json").read_text())["replay"]["logs"][0]["status"] == told
+    assert ("look at which status is logged" in " ".join(done.output.split())) == (fault == "2")
+
+
 @pytest.mark.parametrize(("clock", "jitter_s", "gap"), [("jitter", 2e-4, 1), ("jitter", 3e-4, 60), ("none", 0.0, 0)])
 def test_what_is_advised_of_an_uneven_clock_or_none_can_be_written_and_does(folder, clock, jitter_s, gap, tmp_path):
     """Each row is a tick, whenever it was stamped; one that is lost is a gap."""

@@ -30,7 +30,7 @@ from seaopt.logs.reading.selection import (
     advise_time,
     select,
 )
-from seaopt.signals import Origin, Signal, Table, VectorM, VectorN
+from seaopt.signals import STATUS, Origin, Signal, Table, VectorM, VectorN
 from seaopt.units import factor, si_unit
 
 
@@ -352,7 +352,7 @@ def _remark_on(signal: Signal) -> list[str]:
     low, high = np.fmin.reduce(signal.values), np.fmax.reduce(signal.values)
     if not np.isfinite(low):
         return [f"{signal.name}: holds no number"]
-    if low == high:
+    if low == high and signal.name != STATUS:  # which stays where nothing happens
         return [f"{signal.name}: is constant at {low:.6g} {signal.unit}".rstrip()]
     bits = suspect_wrap(signal.values, low, high)
     if bits is not None:
