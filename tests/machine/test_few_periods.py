@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import seaopt as so
-from seaopt.machine.differences.few_periods import find_widening
+from seaopt.machine.differences.few_periods import find_most_noise, find_widening
 from tests.machine.simulator import Machine, multisine
 from tests.machine.test_pairs import RANGES
 from tests.machine.test_response import LINES
@@ -34,6 +35,20 @@ def test_an_interval_holds_as_often_as_it_states(blocks, spread):
     far = 1.96 * find_widening(blocks, slopes.size)
     held = np.mean([abs(draw_error(rng, blocks, slopes)) < far for _ in range(3000)])
     assert 0.938 < held < (0.965 if spread == 0.0 else 0.985), held  # 0.95, whose std is 0.004
+
+
+@pytest.mark.parametrize("blocks", [3, 6, 18])
+def test_a_right_model_leaves_more_than_most_noise_as_rarely_as_it_states(blocks):
+    noise = np.random.default_rng(6).normal(size=(2, 4000, blocks, 24))
+    rows = noise[0] + 1j * noise[1]
+    mean = rows.mean(axis=1)
+    square = np.sum(np.abs(rows - mean[:, None]) ** 2, axis=1) / (blocks * (blocks - 1))
+    left = np.mean(np.abs(mean) ** 2 / square, axis=1)
+    assert abs(np.mean(left > find_most_noise(blocks, 24)) - 0.05) < 0.012  # whose std is 0.0035
+
+
+def test_of_many_periods_most_noise_is_a_chi_square():
+    assert find_most_noise(400, 24) == pytest.approx(chi2.ppf(0.95, 48) / 48.0, abs=0.02)
 
 
 def test_with_many_periods_an_interval_is_that_of_known_noise():

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from tests.machine.simulator import Machine
+from seaopt.machine.differences import explanations
+from tests.machine.simulator import Machine, multisine
 from tests.machine.test_drive_limit import REFERENCE
-from tests.machine.test_response import FRICTION, dry
+from tests.machine.test_response import FRICTION, LINES, dry
 
 __all__ = ["dry"]  # a fixture
 
@@ -54,6 +55,40 @@ def test_a_later_loop_and_another_fault_are_named_together(controller, bench, fa
         text = " ".join(str(result).split())
         assert " ms later than in the model" in text and ", and " in text
     assert np.sum(np.square(off)) < 10.6, off  # chi square of 2, 99.5 %
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_small_fault_beside_a_later_loop_is_named(controller, bench, monkeypatch, seed):
+    """The delay alone leaves less than twice the noise, and more than noise does of a right model."""
+    log = bench.log(replace(scale(stiffness=0.965), delay_s=1.2e-3), REFERENCE, noise=2.0, seed=seed)
+    with monkeypatch.context() as without:
+        without.setattr(explanations, "find_pairs", lambda *_: [])
+        alone = accept(controller, log).differences
+    assert 1.4 < alone.found[0].left < 2.0 and alone.found[0].name == "delay" and not alone.explained
+    differences = accept(controller, log).differences
+    delay, spring = (find_part(differences.found[0], name)[0] for name in ("delay", "k"))
+    assert delay.low <= 1.2e-3 <= delay.high and spring.low <= 0.965 <= spring.high, differences.found[0]
+    assert differences.explained and differences.found[0].left < 1.3
+
+
+def test_a_rest_beyond_noise_says_that_the_interval_may_not_hold(controller, bench):
+    """A fault that is too small to be named leaves 1.68 times the noise, where noise leaves 1.56 with 95 % at most."""
+    log = bench.log(replace(scale(stiffness=0.968), delay_s=1.2e-3), REFERENCE, noise=2.0, seed=3)
+    result = accept(controller, log)
+    first = result.differences.found[0]
+    assert result.differences.most_noise < first.left < 2.0 and not first.beside
+    assert "the true size may be outside" in " ".join(str(result).split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("periods", [6, 10])
+@pytest.mark.parametrize("fault", [{"damping": 2.0}, {"stiffness": 0.8}, {"delay_s": 1.2e-3}])
+def test_of_ten_logs_of_one_fault_none_has_a_second(controller, bench, fault, periods):
+    reference = multisine(1000, LINES, periods, 60.0, 3)
+    machine = replace(RIGHT, **fault) if "delay_s" in fault else scale(**fault)
+    for seed in range(10):
+        differences = accept(controller, bench.log(machine, reference, noise=2.0, seed=seed)).differences
+        assert differences.explained and not any(each.beside for each in differences.found), (seed, differences.found)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.machine.differences.comparison import TOLERATED, Comparison
-from seaopt.machine.differences.explanations import WORTH, explain
+from seaopt.machine.differences.explanations import explain
 from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
 from seaopt.machine.differences.size_fit import Difference
@@ -40,6 +40,7 @@ class Differences:
     inside: bool  # the machine is one of those that were certified
     each_line: bool  # each line by itself is within reach of them
     misfit: float  # mean square of the difference over its std; 1 is noise
+    most_noise: float  # of such a one that noise leaves of a right model, 95 %
     off: float  # largest share of the response by which it differs, beyond its disc
     off_hz: float | None
     found: tuple[Difference, ...]
@@ -49,8 +50,8 @@ class Differences:
 
     @property
     def explained(self) -> bool:
-        """Whether the first difference leaves no more than twice what noise does, so that its interval holds."""
-        return bool(self.found) and (self.misfit - 1.0) * (1.0 - self.found[0].explains) <= WORTH - 1.0
+        """Whether the first difference leaves no more than noise does, so that its interval holds."""
+        return bool(self.found) and (self.found[0].left or 0.0) <= self.most_noise
 
 
 def compare(
@@ -97,6 +98,7 @@ def compare(
         inside=together and not flat,
         each_line=each_line,
         misfit=before / count,
+        most_noise=comparison.most_noise,
         off=max(float(share[worst]), 0.0),
         off_hz=float(comparison.f[worst]) if share[worst] > TOLERATED else None,
         found=tuple(found),

@@ -15,7 +15,7 @@ from jaxtyping import Complex, Float
 from seaopt.control import Controller, sample
 from seaopt.errors import LogError
 from seaopt.machine.design_run import RTOL, run_design
-from seaopt.machine.differences.few_periods import find_widening
+from seaopt.machine.differences.few_periods import find_most_noise, find_widening
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.judged import Measured
 from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
@@ -72,6 +72,11 @@ class Comparison:
     def widening(self) -> float:
         """By how much sizes that are fitted with weights of :math:`1/s^2` spread more than these tell."""
         return find_widening(min(ratio.blocks for ratio in self.ratios), self.response.size)
+
+    @property
+    def most_noise(self) -> float:
+        """The misfit by line that noise leaves of a right model with 95 % at most."""
+        return find_most_noise(min(ratio.blocks for ratio in self.ratios), self.response.size)
 
     @property
     def f(self) -> Float[np.ndarray, " m"]:

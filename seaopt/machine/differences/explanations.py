@@ -117,7 +117,7 @@ def explain(
     if limit is not None:
         tried = [limit, *tried] if told else sorted((*tried, limit), key=lambda each: each.rank)
     kinds = _group(tried, noise)
-    if tried[0].left > WORTH * noise:
+    if tried[0].left > comparison.most_noise * noise:
         least, starts = min(each.left for each in tried), _list_starts(case, kinds, limit, limited)
         pairs = find_pairs(starts, _list_knobs(case), values, spread, (least, noise))
         kinds = [*([pair] for pair in pairs), *kinds]
@@ -153,6 +153,7 @@ def _list_found(case: Case, kinds: Sequence[list[Tried]], *, told: bool) -> list
             replace(
                 first.difference,
                 explains=share,
+                left=first.left / case.noise,
                 alike=alike,
                 alike_values=values,
                 untold=untold and kind is not kinds[0],

@@ -31,6 +31,7 @@ class Difference:
     high: float | None
     unit: str
     explains: float  # share of the misfit, of what no certified machine has
+    left: float | None = None  # mean square of what it leaves, over the std
     alike: tuple[str, ...] = ()  # parameters that would explain as much
     alike_values: tuple[float, ...] = ()  # their factors
     size: float | None = None  # of a mode: its zero's frequency over its pole's; of a rate: over that of the log
