@@ -25,9 +25,9 @@ from seaopt.machine.differences.certified import Differences, compare
 from seaopt.machine.differences.rate_of_commands import find_rate
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
-from seaopt.machine.reported import Reported, read_status
 from seaopt.machine.response.enclosed import enclose_outer, enclose_ticks
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
+from seaopt.machine.response.reported import Reported, read_status
 from seaopt.machine.response.tripped import Trip, find_refused, find_trip
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand

@@ -11,9 +11,9 @@ from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.free_gains import SAME_GAINS
 from seaopt.machine.replay import Replay
-from seaopt.machine.reported import Reported
 from seaopt.machine.response.judged import Bias
 from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band
+from seaopt.machine.response.reported import Reported
 from seaopt.machine.response.tripped import Trip
 from seaopt.units import unit_after
 
