@@ -19,6 +19,7 @@ from seaopt.control import ForceMPC, RunnableSchedule, ScheduledController
 from seaopt.control.laws.structures import Gains
 from seaopt.errors import SeaoptError
 from seaopt.machine.free_gains import find_same, fit_gains, make_law, read_gains
+from seaopt.machine.gains.edited_table import Edit, list_edits
 from seaopt.machine.stepped import (
     Match,
     Others,
@@ -44,7 +45,9 @@ UNITS = tuple(each**power for each in (1e3, 60.0 / (2.0 * math.pi), 180.0 / math
 SAME_FACTOR = 0.01  # relative: factors that are a unit, or a sign
 MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
 LESS = 0.1  # of what a single cause leaves: another set of gains, which has more to fit, leaves less
+FITTED = ("gain", "factor")  # kinds with a size that is fitted
 MOST_CAUSES = 6
+MOST_ROWS = 50_000  # about the largest mismatch, on which edits of a table are tried: the variable has to move in them
 ASKED = "the outer loop's output"
 SHORT = {"gain": "short, gain", "factor": "short, factor", "late": "short, late"}  # more periods would tell these
 ROWS = (
@@ -57,6 +60,17 @@ ROWS = (
     "aliases",
 )  # why a log of every n-th tick tells nothing
 UNDECIDED = ("rounding", *SHORT.values(), *ROWS)
+
+
+@record
+class Edited:
+    """Where the table of a schedule was edited."""
+
+    over: str  # its variable
+    unit: str
+    points: tuple[float, ...]  # of the edited gains
+    factor: float | None  # of the gains; None: each has its own
+    everywhere: bool = False  # at all points that the log reaches
 
 
 @record
@@ -73,6 +87,7 @@ class Cause:
     exported: Mapping[str, float] | None = None  # those of this law
     sigmas: float | None = None  # stds of rounding, over the whole log, of what no single tick shows
     besides: bool = False  # it is so beside the first cause, and removes what it does together with that
+    edited: Edited | None = None  # of a gain, or gains, in a schedule's table
 
     @property
     def undecided(self) -> bool:
@@ -97,6 +112,7 @@ class Alternative:
     unit: str = ""
     gains: Mapping[str, float] | None = None
     exported: Mapping[str, float] | None = None
+    edited: Edited | None = None
 
 
 def find_causes(whole: Setting, match: Match, others: Others) -> tuple[tuple[Cause, ...], Setting]:
@@ -113,6 +129,15 @@ def find_causes(whole: Setting, match: Match, others: Others) -> tuple[tuple[Cau
     if not before:
         return (), whole
     tried = sorted(_try_all(window, others), key=_rank)
+    if not tried or not tried[0][1].met or tried[0][0].kind in FITTED:
+        size = min(len(whole.ticks), MOST_ROWS)
+        begin = max(0, min(middle - size // 2, len(whole.ticks) - size))
+        edited = _try_table(replace(whole, ticks=whole.ticks.take(slice(begin, begin + size))))
+        if edited is not None:
+            energy = float(np.mean(match.error[begin : begin + size] ** 2))
+            rest = [_make_cause(*pair, before) for pair in tried[: MOST_CAUSES - 1] if not pair[1].met]
+            shown = [cause for cause in rest if cause.removes > 0.0]
+            return (_make_cause(*edited, energy), *shown), edited[0].change(whole)
     if not tried or tried[0][1].energy >= before:
         return (), whole
     causes = [_make_cause(*pair, before) for pair in tried[:MOST_CAUSES]]
@@ -179,12 +204,43 @@ def _try_gains(whole: Setting, window: Setting, energy: float, others: Others) -
     return played if played is not None and (played[1].met or played[1].energy < LESS * energy) else None
 
 
+def _try_table(setting: Setting) -> Tried | None:
+    """Return the edit of a schedule's table that explains the log, and its match; None where none does."""
+    alternatives = (_make_edit(setting, edit) for edit in list_edits(setting))
+    return next((pair for pair in _play_each(setting, alternatives) if pair[1].met), None)
+
+
+def _make_edit(setting: Setting, edit: Edit) -> Alternative:
+    law = setting.law
+    assert isinstance(law, RunnableSchedule)
+    changed, (name, *further), point = edit.change(law), edit.names, edit.points[0]
+    alone = len(edit.points) == 1
+    exported, gains = (
+        {each: float(table.gains[each][point]) for each in edit.names} for table in (law.table, changed.table)
+    )
+    return Alternative(
+        kind="gains" if further else "gain",
+        what="law" if further else name,
+        value=gains[name] if alone and not further else None,
+        change=lambda given: replace(given, law=changed),
+        gains=gains if alone else None,
+        exported=exported if alone else None,
+        edited=Edited(
+            over=law.table.over,
+            unit=law.table.unit,
+            points=tuple(law.table.points[list(edit.points)].tolist()),
+            factor=edit.factors[0] if len(edit.factors) == 1 else None,
+            everywhere=not alone,
+        ),
+    )
+
+
 def _rank(pair: Tried) -> tuple[bool, bool, bool, float]:
     """Return the order of a cause: one that explains all first, and of those the ones without a fitted size. At the
     limit many do: a sign runs away, a unit seldom does.
     """
     alternative, match = pair
-    fitted, unit = alternative.kind in ("gain", "factor"), alternative.kind == "unit"
+    fitted, unit = alternative.kind in FITTED, alternative.kind == "unit"
     return not match.met, match.met and fitted, match.met and unit, match.energy
 
 
@@ -198,6 +254,7 @@ def _make_cause(alternative: Alternative, played: Match, before: float) -> Cause
         explains=played.met,
         gains=alternative.gains,
         exported=alternative.exported,
+        edited=alternative.edited,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +18,14 @@ from seaopt.control import (
     runnable,
     tune_schedule,
 )
+from seaopt.control.laws.structures import Gains
 from seaopt.control.running.law_step import run_law
+from seaopt.formatting import format_number
 from seaopt.machine.design_run import run_design
 from seaopt.machine.free_gains import read_gains
 from seaopt.machine.stepped import Setting
 from seaopt.machine.ticks import Ticks
+from seaopt.machine.wording import say_cause
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES, REFERENCE, respond
 
@@ -272,3 +276,68 @@ def test_a_cascade_is_replayed_and_another_set_of_its_gains_is_named():
     (row,) = so.accept(law, [play(made)]).replays
     assert (row.causes[0].kind, row.causes[0].explains) == ("gains", True)
     assert row.causes[0].gains == pytest.approx(other.by_name(), rel=1e-4)
+
+
+def edit(schedule, factors):
+    """Return the schedule with gains of its table times factors, by name one for each point."""
+    controllers = []
+    for i, each in enumerate(schedule.controllers):
+        gains = {name: value * factors.get(name, (1.0, 1.0))[i] for name, value in each.gains.items()}
+        law = Gains.from_names(gains).law(each.spec.structure, each.sample_time_s).balanced()
+        controllers.append(replace(each, gains=gains, law=law))
+    return replace(schedule, controllers=tuple(controllers))
+
+
+@pytest.mark.parametrize(
+    ("factors", "points", "gains"),
+    [
+        ({"k_p": [1.0, 1.3]}, [8e5], {"k_p": 1.3}),
+        ({"k_i": [0.8, 1.0]}, [5e5], {"k_i": 0.8}),
+        ({"T_f": [2.0, 1.0]}, [5e5], {"T_f": 2.0}),
+        ({"k_d": [1.2, 1.2]}, [5e5, 8e5], {"k_d": 1.2}),
+        ({name: [1.0, 0.7] for name in ("k_p", "k_i", "k_d", "k_r")}, [8e5], None),
+        ({"k_p": [1.0, 0.7], "k_i": [1.0, 1.4], "k_d": [1.0, 1.1]}, [8e5], {"k_p": 0.7, "k_i": 1.4, "k_d": 1.1}),
+    ],
+)
+def test_an_edited_gain_of_a_table_is_named_with_its_point_and_factor(
+    schedule, compiler, tmp_path, factors, points, gains
+):
+    places = 6.5e5 + 1.4e5 * np.sin(2e-3 * np.arange(REFERENCE.size))
+    log = Bench(compiler, tmp_path, edit(schedule, factors)).log(Machine(), REFERENCE, places=places, decimals=3)
+    (row,) = so.accept(schedule, [log]).replays
+    first = row.causes[0]
+    assert not row.met and first.explains and first.edited is not None, row
+    assert list(first.edited.points) == points and (first.edited.over, first.edited.unit) == ("k", "N/m")
+    if gains is None:
+        assert first.kind == "gains" and first.edited.factor == pytest.approx(0.7, rel=0.01)
+    elif len(gains) == 1:
+        ((name, factor),) = gains.items()
+        assert (first.kind, first.what) == ("gain", name) and first.edited.factor == pytest.approx(factor, rel=0.01)
+    else:
+        found = {name: first.gains[name] / first.exported[name] for name in first.gains}
+        assert first.kind == "gains" and found == pytest.approx(dict.fromkeys(found, 1.0) | gains, rel=0.01)
+    said = "at all points of k" if len(points) > 1 else f"at k = {format_number(points[0])} N/m"
+    assert said in say_cause(first)
+
+
+def test_an_entry_of_the_table_that_was_edited_in_the_c_is_named(schedule, compiler, tmp_path):
+    """Its anti-windup stays what was exported."""
+    so.export(schedule, tmp_path / "law", allow_infeasible=True)
+    source, number = tmp_path / "law" / "force_law.c", float(schedule.table.gains["k_p"][0])
+    text = source.read_text()
+    written = [each for each in set(re.findall(r"[0-9.]+e?[-+]?[0-9]*", text)) if is_near(each, number)]
+    assert len(written) == 1
+    source.write_text(text.replace(written[0], f"{1.25 * number:.17g}"))
+    places = 6.5e5 + 1.4e5 * np.sin(2e-3 * np.arange(REFERENCE.size))
+    log = Bench(compiler, tmp_path, schedule, exported=True).log(Machine(), REFERENCE, places=places, decimals=3)
+    (row,) = so.accept(schedule, [log]).replays
+    first = row.causes[0]
+    assert (first.kind, first.what, first.edited.points, first.explains) == ("gain", "k_p", (5e5,), True)
+    assert first.edited.factor == pytest.approx(1.25, rel=0.01)
+
+
+def is_near(text, number):
+    try:
+        return abs(float(text) / number - 1.0) < 1e-9
+    except ValueError:
+        return False

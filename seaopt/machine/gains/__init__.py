@@ -1,0 +1,1 @@
+"""Which gains a schedule's table has, told by what it commanded."""
