@@ -11,7 +11,10 @@ import scipy.linalg
 import seaopt as so
 from seaopt.control import Impedance, add_impedance
 from seaopt.machine.design_run import run_design
-from tests.machine.simulator import multisine
+from tests.machine.simulator import Bench, Machine, multisine
+from tests.machine.test_hidden import LINES as KNEE_LINES
+from tests.machine.test_hidden import SPEC as KNEE_SPEC
+from tests.machine.test_hidden import STATED
 
 T = 1e-3
 KNEE = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "k_s": 300.0}
@@ -252,3 +255,15 @@ def test_what_differs_under_a_running_impedance_is_named(impedance, monkeypatch)
 def test_a_goal_that_stands_still_says_what_to_record(impedance):
     result = so.accept(impedance, [make_log(run(impedance, np.full(4000, 0.1)))], link=take_link())
     assert result.replayed and result.response is None and "periodic multisine" in result.left_out["knee"]
+
+
+def test_a_log_of_the_force_law_alone_is_simulated_without_the_outer_loop(compiler, tmp_path):
+    """With dry friction, which takes a simulation: the machine's own bench knows no outer loop."""
+    locked, free = so.plants.rotary(link="locked"), so.plants.rotary()
+    values = free.complete(so.ParameterSet()).update(**STATED)
+    force = so.tune(locked, values, replace(KNEE_SPEC, structure="pid"))
+    law = add_impedance(force, free, values, Impedance(stiffness=20.0, damping=1.0), name="knee")
+    reference = np.concatenate([multisine(1000, KNEE_LINES, 3, 3.0, seed) for seed in range(6)])
+    log = Bench(compiler, tmp_path, force).log(Machine.of_knee(values), reference, noise=0.02)
+    result = so.accept(law, [log])
+    assert result.differences.inside and result.response.met and not result.enclosed, result

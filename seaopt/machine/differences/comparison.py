@@ -109,7 +109,7 @@ class Comparison:
         """Return the periods of the law on the nonlinear plant with each of some values, under the logged references
         and cut as the logs are, by amplitude.
         """
-        source, share = self.controller, 1.0
+        source, share = replace(self.controller, outer=None), 1.0  # what was given is the force law's reference
         if self.apart is not None and self.apart.outer is not None:
             source, share = replace(self.apart, design=source.design), 1.0 / self.apart.outer.per_given
         runs = [run_design(source, sets, share * ticks.reference, rate=self.rate) for ticks in self.logs]
