@@ -263,7 +263,7 @@ def test_a_log_of_the_force_law_alone_is_simulated_without_the_outer_loop(compil
     values = free.complete(so.ParameterSet()).update(**STATED)
     force = so.tune(locked, values, replace(KNEE_SPEC, structure="pid"))
     law = add_impedance(force, free, values, Impedance(stiffness=20.0, damping=1.0), name="knee")
-    reference = np.concatenate([multisine(1000, KNEE_LINES, 3, 3.0, seed) for seed in range(6)])
+    reference = np.concatenate([multisine(1000, KNEE_LINES, 3, 1.0, seed) for seed in range(6)])
     log = Bench(compiler, tmp_path, force).log(Machine.of_knee(values), reference, noise=0.02)
     result = so.accept(law, [log])
-    assert result.differences.inside and result.response.met and not result.enclosed, result
+    assert result.differences.inside and result.differences.misfit < 2.0 and not result.enclosed, result
