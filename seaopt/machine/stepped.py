@@ -35,6 +35,7 @@ from seaopt.control import (
     RunnableLaw,
     RunnableSchedule,
     ScheduledController,
+    ScheduleState,
     force_mpc,
     runnable,
 )
@@ -233,6 +234,8 @@ def play(setting: Setting) -> Match:
         yield from list_starts(setting)
         if not isinstance(setting.law, ForceMPC):
             yield replace(setting.law.reset(), x=_estimate_start(linear, head, allowed_head)), 0
+        if isinstance(setting.law, RunnableSchedule) and (moved := _estimate_moving(setting, head, allowed_head)):
+            yield moved, 0
 
     for start, first in starts():
         rows = head if not first else ticks.take(slice(first, first + len(head)))
@@ -367,6 +370,25 @@ def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, "
     left, weight = ticks.command - follow(law, ticks, limited), 1.0 / allowed[~limited]
     modes = find_modes(law, limited)[~limited] * weight[:, None]
     return np.linalg.lstsq(modes, left[~limited] * weight, rcond=1e-10)[0]
+
+
+def _estimate_moving(setting: Setting, ticks: Ticks, allowed: Float[np.ndarray, " m"]) -> ScheduleState | None:
+    """Return a state from which a schedule whose variable moves matches the first rows, up to the first at a limit, as
+    well as it can: it is linear in its state, at whatever places. None where they are too few.
+    """
+    schedule = setting.law
+    assert isinstance(schedule, RunnableSchedule) and ticks.place is not None
+    at_limit = find_at_limit(ticks, setting.linear)
+    rows = int(np.argmax(at_limit)) if np.any(at_limit) else len(ticks)
+    begin = schedule.reset(place=float(ticks.place[0]))
+    if rows < 3 * max(begin.x.size, 1) or not begin.x.size:
+        return None
+    free, first = replace(setting, law=limit_law(schedule, math.inf)), ticks.take(slice(0, rows))
+    still = run_setting(free, first, replace(begin, x=0.0 * begin.x))
+    ways = [run_setting(free, first, replace(begin, x=unit)) - still for unit in np.eye(begin.x.size)]
+    weight = 1.0 / allowed[:rows]
+    modes = np.column_stack(ways) * weight[:, None]
+    return replace(begin, x=np.linalg.lstsq(modes, (first.command - still) * weight, rcond=1e-10)[0])
 
 
 def find_offset(law: RunnableLaw, ticks: Ticks, log: Ticks, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -57,6 +57,22 @@ def test_a_schedule_is_judged_where_its_variable_stood(schedule, scheduled):
     assert stiff.replayed and not stiff.met and stiff.differences.found[0].name == "k", stiff
 
 
+@pytest.mark.parametrize("ramp", [False, True])
+def test_a_log_that_begins_in_the_middle_of_a_move_is_of_the_schedule(schedule, scheduled, compiler, tmp_path, ramp):
+    """The state at its first row is told at the places of the rows after it, not at the middle of all places."""
+    n = REFERENCE.size
+    places = np.linspace(5e5, 8e5, n) if ramp else 6.5e5 + 1.4e5 * np.sin(2e-3 * np.arange(n))
+    (row,) = so.accept(
+        schedule, [scheduled.log(Machine(), REFERENCE, places=places, decimals=3).between(0.3, 9.9)]
+    ).replays
+    assert row.met, row
+    bench = Bench(compiler, tmp_path, edit(schedule, {"k_p": [1.25, 1.0]}))
+    (row,) = so.accept(schedule, [bench.log(Machine(), REFERENCE, places=places, decimals=3).between(0.3, 9.9)]).replays
+    first = row.causes[0]
+    assert not row.met and first.explains and (first.what, first.edited.points) == ("k_p", (5e5,)), row
+    assert first.edited.factor == pytest.approx(1.25, rel=0.01)
+
+
 def test_a_schedule_whose_variable_moves_is_replayed_and_has_no_response(schedule, scheduled):
     places = np.linspace(5e5, 8e5, REFERENCE.size)
     result = so.accept(schedule, [scheduled.log(Machine(), REFERENCE, places=places, decimals=2)])
