@@ -15,6 +15,7 @@ from seaopt.control import Controller, ForceMPC, ScheduledController, draw, runn
 from seaopt.control.deploy.target import hash_law
 from seaopt.control.laws.delay import find_drive
 from seaopt.control.loops.sampled_plant import conditions
+from seaopt.control.scheduling.scheduled_controller import place_variable
 from seaopt.errors import LogError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import join_words
@@ -296,6 +297,8 @@ def accept(
     blocks, left_out = list[Blocks](), dict[str, str]()
     around = all(ticks.rendered is not None for ticks in rows)
     if around and link is not None:
+        if place is not None:
+            link = link[0], place_variable(*link, place[0], place[1])
         enclosed = enclose_outer(law, link)
         rows, law = [enclose_ticks(enclosed, law, ticks) for ticks in rows], enclosed
         result = replace(result, enclosed=True)

@@ -249,13 +249,12 @@ def play(setting: Setting) -> Match:
     commands = np.concatenate([ticks.command[:first], run_setting(setting, ticks.take(slice(first, None)), start)])
     if linear.compensation is not None:  # which differences to a row before the first
         commands[0] = ticks.command[0]
-    left = commands - ticks.command
     if setting.rounded:
-        left = left - find_offset(linear, ticks, log, left)
+        commands = commands - find_offset(linear, ticks, log, commands - ticks.command)
     return Match(
         commands=commands,
         allowed=allowed,
-        error=left,
+        error=commands - ticks.command,
         integrals=count_integrals(linear),
         allowed_within=allowed_within,
     )

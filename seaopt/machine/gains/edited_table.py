@@ -123,7 +123,7 @@ class _Fit:
     law: RunnableSchedule
     start: LawState
     free: Bool[np.ndarray, " n"]
-    basis: Float[np.ndarray, "n m"]
+    basis: Float[np.ndarray, "k m"]
     exported: Float[np.ndarray, " n"]  # the commands of what was exported
 
     @classmethod

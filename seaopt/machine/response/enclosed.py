@@ -43,7 +43,7 @@ def enclose_ticks(enclosed: Controller, controller: Controller, ticks: Ticks) ->
     kept = keep_share(find_position(enclosed.design[0], controller.outer) or "")
     if kept < 1.0:  # a link that nothing holds, whose place drifts
         position = np.asarray(lfilter([1.0, -1.0], [1.0, -kept], position - position[0]))
-    measured = ticks.measured if len(enclosed.signals) == len(controller.signals) else None
-    measured = np.column_stack([ticks.measured, position]) if measured is None else measured
+    reads_it = len(enclosed.signals) == len(controller.signals)
+    measured = ticks.measured if reads_it else np.column_stack([ticks.measured, position])
     beside = {name: part for name, part in ticks.beside.items() if name not in enclosed.signals}
     return replace(ticks, reference=given, measured=measured, beside=beside, rendered=None, given=None)

@@ -519,4 +519,5 @@ def require_constrained(runs: ConstrainedRuns, max_failure_probability: float | 
         return (failures,)
     text = f"{format_count(runs.failures, 'failure')} in {format_count(runs.runs, 'run')}"
     bound = runs.failure_probability_bound
-    return failures, require_at_most(CONSTRAINED_PROBABILITY, bound, max_failure_probability, text=text)
+    probability = require_at_most(CONSTRAINED_PROBABILITY, bound, max_failure_probability, text=text)
+    return failures, replace(probability, risk=1.0 - runs.confidence)

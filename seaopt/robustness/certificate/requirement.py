@@ -24,7 +24,7 @@ UNSTABLE_LOOP = "the loop is UNSTABLE"
 DESIGN_PLANT = "design plant"  # whose own limits are judged
 # Of which plants a check speaks: at the nominal parameters, at draws of them, at all of a range, those that were
 # measured, or runs that were simulated; "" in an older file.
-CheckScope = Literal["", "nominal", "drawn", "proved", "measured", "simulated"]
+CheckScope = Literal["", "nominal", "drawn", "measured", "simulated"]
 
 
 class Spot(NamedTuple):
@@ -73,7 +73,7 @@ class Requirement(Result):
         What was found besides, and what to do about it.
     count : int
         Runs that miss it in the same way, of which this is the worst.
-    scope : {"nominal", "drawn", "proved", "measured", "simulated"}
+    scope : {"nominal", "drawn", "measured", "simulated"}
         What is known by it; "" in an older file.
     risk : float or None
         Share of the risk: the probability with which chance makes the statement wrong; None where none is stated.

@@ -58,7 +58,7 @@ def measure_stretches(survey: Survey, progress: Progress) -> Evidence:
     bounds = map_ordered(partial(_bound_plants, shared, cases.unknown.nominal), pairs, survey.executor)
     stretches = tuple(bound for _ in count_off(pairs, "stretch", progress) for bound in next(bounds))
     rows = [*_require_limits_between(schedule), *_refute_limits_between(schedule, stretches)]
-    return Evidence(requirements=rows, fields={"stretches": stretches}, scope="proved")
+    return Evidence(requirements=rows, fields={"stretches": stretches}, scope="nominal")
 
 
 def join_places(survey: Survey, _: Progress) -> Evidence:
