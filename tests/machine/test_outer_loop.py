@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 import seaopt as so
-from seaopt.control import Impedance, add_impedance
+from seaopt.control import Impedance, add_impedance, tune_schedule
 from seaopt.machine.design_run import run_design
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_hidden import LINES as KNEE_LINES
@@ -267,3 +267,15 @@ def test_a_log_of_the_force_law_alone_is_simulated_without_the_outer_loop(compil
     log = Bench(compiler, tmp_path, force).log(Machine.of_knee(values), reference, noise=0.02)
     result = so.accept(law, [log])
     assert result.differences.inside and result.differences.misfit < 2.0 and not result.enclosed, result
+
+
+def test_the_link_of_a_schedule_is_where_its_variable_stood(impedance):
+    """The values of the link are given at another place: the machine is the one where the log was taken."""
+    knee, values = take_link()
+    schedule = tune_schedule(so.plants.rotary(link="locked"), values, impedance.spec, "k_s", [200.0, 400.0])
+    around = [replace(each, outer=impedance.outer) for each in schedule.controllers]
+    schedule = replace(schedule, controllers=tuple(around))
+    rows = run(schedule.at(KNEE["k_s"]), 0.4 * excite(20.0, 3))
+    link = knee, values.update(k_s=200.0)
+    result = so.accept(schedule, [make_log(rows)], at=KNEE["k_s"], link=link)
+    assert result.replayed and result.enclosed and result.differences.inside, result
