@@ -343,12 +343,12 @@ def _list_requirements(certificate: Certificate) -> Section:
             format_number(row.value),
             f"{row.sense} {format_number(row.limit)}",
             unit_after(row.unit).strip(),
-            row.scope + ("" if row.risk is None else f", risk {row.risk:.2g}"),
-            f"{row.where} (the worst of {count} such failures)" if count > 1 else row.where,
+            (f"{row.where} (the worst of {count} such failures)" if count > 1 else row.where)
+            + ("" if row.risk is None else f"; {row.scope}, risk {row.risk:.2g}"),
         )
         for row, count in groups
     )
-    head = ("verdict", "requirement", "value", "limit", "unit", "known by", "where")
+    head = ("verdict", "requirement", "value", "limit", "unit", "where")
     remark = (
         "Worst case, of its limits: the largest share of a limit that the worst parameters found use; 1 is all of it."
         if certificate.models
@@ -359,7 +359,7 @@ def _list_requirements(certificate: Certificate) -> Section:
         title="Requirements",
         part="certificate",
         screen=False,
-        tables=(Table(head=head, rows=rows, align="<<>><<<"),),
+        tables=(Table(head=head, rows=rows, align="<<>><<"),),
         remarks=(remark,),
     )
 
