@@ -296,13 +296,10 @@ def accept(
     rows = [_end_at_trip(ticks, find_trip(law, ticks)) for ticks in rows]
     blocks, left_out = list[Blocks](), dict[str, str]()
     around = all(ticks.rendered is not None for ticks in rows)
-    if around and link is not None:
-        if place is not None:
-            link = link[0], place_variable(*link, place[0], place[1])
-        enclosed = enclose_outer(law, link)
-        rows, law = [enclose_ticks(enclosed, law, ticks) for ticks in rows], enclosed
-        result = replace(result, enclosed=True)
-    apart = result.controller if result.enclosed else None
+    apart = law if around and link is not None else None  # the force law, where `law` has the outer loop in it
+    if apart is not None and link is not None:
+        law = enclose_outer(apart, link if place is None else (link[0], place_variable(*link, place[0], place[1])))
+        rows, result = [enclose_ticks(law, ticks) for ticks in rows], replace(result, enclosed=True)
     judge = partial(judge_response, tracks=apart is None)
     for ticks, row in zip(rows, replays, strict=True):
         try:

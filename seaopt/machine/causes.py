@@ -18,8 +18,8 @@ from jaxtyping import Float
 from seaopt.control import ForceMPC, RunnableSchedule, ScheduledController
 from seaopt.control.laws.structures import Gains
 from seaopt.errors import SeaoptError
-from seaopt.machine.free_gains import find_same, fit_gains, make_law, read_gains
 from seaopt.machine.gains.edited_table import Edit, list_edits
+from seaopt.machine.gains.free_gains import find_same, fit_gains, make_law, read_gains
 from seaopt.machine.stepped import (
     Match,
     Others,
@@ -30,6 +30,7 @@ from seaopt.machine.stepped import (
     find_limited,
     find_modes,
     follow,
+    keep_over,
     limit_law,
     make_setting,
     play,
@@ -286,9 +287,8 @@ def list_others(setting: Setting, others: Others) -> Iterator[Alternative]:
     """Yield laws that may have run in its place, of those that read the same."""
     law, signals = setting.law, setting.controller.signals
     over = law.table.over if isinstance(law, RunnableSchedule) else None
-    for name, other in others.items():
-        placed = not isinstance(other, ScheduledController) or other.over == over
-        if placed and stand(other, None).signals == signals:
+    for name, other in keep_over(others, over).items():
+        if stand(other, None).signals == signals:
             yield Alternative(kind="another law", what=name, change=lambda given, other=other: _take_law(given, other))
 
 

@@ -37,10 +37,10 @@ from seaopt.control.loops.law import Law
 from seaopt.errors import LogError
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_parts, name_factor
-from seaopt.machine.free_gains import read_gains
+from seaopt.machine.gains.free_gains import read_gains
 from seaopt.machine.response.periods import Blocks, cut_periods
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
-from seaopt.machine.stepped import SAME_PLACE, Others, Setting, stand
+from seaopt.machine.stepped import SAME_PLACE, Others, Setting, keep_over, stand
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
@@ -290,7 +290,7 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
         return LineMatch(causes=(leave_open("terms", "law"),))
     if ticks.rendered is not None:
         return LineMatch(causes=(leave_open("outer", "loop"),))
-    place, others = math.nan, _keep_over(others, law.table.over if isinstance(law, RunnableSchedule) else None)
+    place, others = math.nan, keep_over(others, law.table.over if isinstance(law, RunnableSchedule) else None)
     if isinstance(law, RunnableSchedule):
         place = law.fallback if ticks.middle is None else ticks.middle
         moved = 0.0 if ticks.place is None else float(np.ptp(ticks.place))
@@ -326,15 +326,6 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
     size = np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0)) * abs(controller.command.per_effort)
     allowed = float(np.sqrt(np.sum((found.std * size) ** 2)))
     return LineMatch(causes=causes, off=np.abs(found.mean) * size, allowed=allowed, late=found.late, possible=possible)
-
-
-def _keep_over(others: Others, over: str | None) -> Others:
-    """Return the laws that may run in place of one, scheduled over a variable or not: none scheduled over another."""
-    return {
-        name: other
-        for name, other in others.items()
-        if not isinstance(other, ScheduledController) or other.over == over
-    }
 
 
 def evaluate(law: Law, blocks: Blocks, ticks_per_row: int, image: int = 0) -> Complex[np.ndarray, "k m"]:

@@ -34,7 +34,7 @@ from jaxtyping import Complex, Float
 from seaopt.control import RunnableLaw
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.machine.causes import Alternative, Cause, list_others, list_parts
-from seaopt.machine.free_gains import make_law, read_gains
+from seaopt.machine.gains.free_gains import make_law, read_gains
 from seaopt.machine.response.periods import find_period
 from seaopt.machine.stepped import (
     FLOOR,
@@ -42,8 +42,8 @@ from seaopt.machine.stepped import (
     Others,
     Setting,
     count_integrals,
-    is_rounded,
     leave_integrals,
+    list_steps,
     play,
 )
 from seaopt.machine.ticks import find_saturated
@@ -76,7 +76,7 @@ class Segments:
         """Return those of a law's replay."""
         ticks, rows = setting.ticks, min(SEGMENT, len(setting.ticks))
         window, f = np.hanning(rows + 1)[:-1], np.fft.rfftfreq(rows)[1:]
-        responses, steps = respond(setting.linear, f), list_steps(setting) * setting.rounded
+        responses, steps = respond(setting.linear, f), list_steps(setting.ticks) * setting.rounded
         power = float(np.sum(window**2)) / 12.0
         floor = power * (ticks.quantum**2 + (FLOOR**2 * float(np.std(ticks.command))) ** 2)
         variance = floor + np.sum(power * steps[:, None] ** 2 * np.abs(responses) ** 2, axis=0)
@@ -116,13 +116,6 @@ class Segments:
             return share, std
         without = (np.sum(shared) - shared) / (np.sum(size) - size)
         return share, max(std, math.sqrt((count - 1) / count * float(np.sum((without - share) ** 2))))
-
-
-def list_steps(setting: Setting) -> Float[np.ndarray, " k"]:
-    """Return the steps that reference and readings are rounded to; none of a reference of steps."""
-    ticks = setting.ticks
-    first = find_quantisation(ticks.reference) if is_rounded(ticks.reference) else 0.0
-    return np.array([first, *map(find_quantisation, ticks.measured.T)])
 
 
 def respond(law: RunnableLaw, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:

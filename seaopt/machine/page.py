@@ -12,7 +12,7 @@ from seaopt.machine.acceptance import EXPLAINED, Acceptance
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.figures import list_panels
-from seaopt.machine.free_gains import read_gains
+from seaopt.machine.gains.free_gains import read_gains
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import LEAST_PHASES, SHORT_BY, Judged, Measured, Response, compares_amplitudes

@@ -95,6 +95,15 @@ def stand(source: Source, place: float | None) -> Controller:
     return source
 
 
+def keep_over(others: Others, over: str | None) -> Others:
+    """Return the laws that may run in place of one, scheduled over a variable or not: none scheduled over another."""
+    return {
+        name: other
+        for name, other in others.items()
+        if not isinstance(other, ScheduledController) or other.over == over
+    }
+
+
 def make_setting(source: Source, ticks: Ticks) -> Setting:
     """Return a law on a log."""
     law: Any = source
@@ -223,7 +232,8 @@ def play(setting: Setting) -> Match:
     ticks, linear = setting.ticks, setting.linear
     head = ticks.take(slice(0, count_head(linear)))
     log = setting.log or ticks
-    allowed, allowed_within = _allow(linear, ticks, log, rounded=setting.rounded)
+    steps = list_steps(log) if setting.rounded else np.zeros(1 + log.measured.shape[1])
+    allowed, allowed_within = _allow(linear, ticks, log, steps)
     allowed_head, floor = allowed[: len(head)], FLOOR * float(np.std(log.command))
     # A start that is nearly right drifts in the integrals: what the floor allows is not taken for rounding.
     exact = float(np.mean(allowed_head**2)) - (1.0 - EXACT**2) * floor**2
@@ -249,8 +259,7 @@ def play(setting: Setting) -> Match:
     commands = np.concatenate([ticks.command[:first], run_setting(setting, ticks.take(slice(first, None)), start)])
     if linear.compensation is not None:  # which differences to a row before the first
         commands[0] = ticks.command[0]
-    if setting.rounded:
-        commands = commands - find_offset(linear, ticks, log, commands - ticks.command)
+    commands = commands - find_offset(linear, ticks, float(steps[0]), commands - ticks.command)
     return Match(
         commands=commands,
         allowed=allowed,
@@ -390,11 +399,10 @@ def _estimate_moving(setting: Setting, ticks: Ticks, allowed: Float[np.ndarray, 
     return replace(begin, x=np.linalg.lstsq(modes, (first.command - still) * weight, rcond=1e-10)[0])
 
 
-def find_offset(law: RunnableLaw, ticks: Ticks, log: Ticks, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def find_offset(law: RunnableLaw, ticks: Ticks, step: float, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return what a law's integrals make of the mean of a reference's rounding, as an error has it: where the reference
-    repeats it is the same in each period. It is no more than half a step.
+    repeats it is the same in each period. It is no more than half of the `step` that it is rounded to.
     """
-    step = find_quantisation(log.reference) if is_rounded(log.reference) else 0.0
     if not step or not count_integrals(law) or np.any(find_at_limit(ticks, law)):
         return np.zeros(len(ticks))
     impulse = np.concatenate([[law.d_reference], list_powers(law.c, law.a, len(ticks) - 1) @ law.b_reference])
@@ -402,7 +410,13 @@ def find_offset(law: RunnableLaw, ticks: Ticks, log: Ticks, error: Float[np.ndar
     return float(np.clip(steady @ error / (steady @ steady), -0.5 * step, 0.5 * step)) * steady
 
 
-def is_rounded(reference: Float[np.ndarray, " n"]) -> bool:
+def list_steps(ticks: Ticks) -> Float[np.ndarray, " k"]:
+    """Return the steps that reference and readings are rounded to; none of a reference of steps."""
+    first = find_quantisation(ticks.reference) if _is_rounded(ticks.reference) else 0.0
+    return np.array([first, *map(find_quantisation, ticks.measured.T)])
+
+
+def _is_rounded(reference: Float[np.ndarray, " n"]) -> bool:
     """Tell whether a reference may be logged with fewer digits than the law was given: not where it is steps, which
     has few values and stays at each.
     """
@@ -410,23 +424,22 @@ def is_rounded(reference: Float[np.ndarray, " n"]) -> bool:
     return np.unique(reference).size >= LEVELS or moves > MOVING
 
 
-def _allow(law: RunnableLaw, ticks: Ticks, log: Ticks, *, rounded: bool) -> tuple[Float[np.ndarray, " n"], float]:
-    """Return one std of what rounding allows at each row, of the command and of what the law saw if that is `rounded`
-    in the log, and its rms within stretches.
+def _allow(
+    law: RunnableLaw, ticks: Ticks, log: Ticks, steps: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " n"], float]:
+    """Return one std of what rounding allows at each row, of the command and of what the law saw, which is rounded to
+    `steps` in the log, and its rms within stretches.
     """
     from scipy.signal import fftconvolve  # deferred: 0.3 s
 
     n, integrals = len(ticks), count_integrals(law)
     response = find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
-    steps: list[Any] = []
-    if is_rounded(log.reference):
-        steps.append((law.b_reference, law.d_reference, ticks.reference, log.reference))
-    columns = np.reshape(law.b_measurement, (law.c.size, -1)), np.ravel(law.d_measurement)
-    steps += [(columns[0][:, i], columns[1][i], ticks.measured[:, i], log.measured[:, i]) for i in range(law.measured)]
+    columns = np.column_stack([law.b_reference, np.reshape(law.b_measurement, (law.c.size, -1))])
+    direct, seen = np.append(law.d_reference, law.d_measurement), np.column_stack([ticks.reference, ticks.measured])
     variance = np.full(n, log.quantum**2 / 12.0 + (FLOOR * float(np.std(log.command))) ** 2)
     within = float(variance[0])
-    for b, d, values, logged in steps if rounded else ():
-        each = find_quantisation(logged) ** 2 / 12.0
+    for b, d, values, step in zip(columns.T, direct, seen.T, steps, strict=True):
+        each = step**2 / 12.0
         if each:
             impulse = np.concatenate([[law.per_effort * d], response @ b])
             within += each * float(np.mean(np.cumsum(impulse**2)))

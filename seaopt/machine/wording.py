@@ -9,7 +9,7 @@ from seaopt.formatting import format_number, join_words
 from seaopt.machine.causes import Cause, Edited
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
-from seaopt.machine.free_gains import SAME_GAINS
+from seaopt.machine.gains.free_gains import SAME_GAINS
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.judged import Bias
 from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band

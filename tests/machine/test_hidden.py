@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.machine.free_gains import make_law, read_gains
+from seaopt.machine.gains.free_gains import make_law, read_gains
 from seaopt.machine.hidden import Segments, find_hidden, respond
 from seaopt.machine.stepped import make_setting, play
 from seaopt.machine.ticks import take_ticks

@@ -22,7 +22,7 @@ from seaopt.control.laws.structures import Gains
 from seaopt.control.running.law_step import run_law
 from seaopt.formatting import format_number
 from seaopt.machine.design_run import run_design
-from seaopt.machine.free_gains import read_gains
+from seaopt.machine.gains.free_gains import read_gains
 from seaopt.machine.stepped import Setting
 from seaopt.machine.ticks import Ticks
 from seaopt.machine.wording import say_cause

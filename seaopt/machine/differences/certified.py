@@ -69,8 +69,8 @@ def compare(
         return None
     dry = has_dry_friction(controller)
     logs_taken = [*map(shorten, logs)] if dry else logs
-    drifts = apart is not None and apart.outer is not None and not apart.outer.stiffness  # the link's place
-    names = apart.signals if drifts and apart is not None else controller.signals
+    # Without a stiffness the link's place, which the enclosed law reads, drifts.
+    names = controller.signals if apart is None or apart.renders else apart.signals
     comparison = Comparison(controller=controller, measured=measured, logs=logs_taken, names=names, apart=apart)
     beside = replace(comparison, names=_list_beside(measured, controller.signals))
     plant, values = controller.design

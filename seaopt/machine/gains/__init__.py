@@ -1,1 +1,1 @@
-"""Which gains a schedule's table has, told by what it commanded."""
+"""Which gains a law, or a schedule's table, has, told by what it commanded."""

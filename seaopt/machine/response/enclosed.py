@@ -34,16 +34,16 @@ def enclose_outer(controller: Controller, link: tuple[Plant, ParameterSet]) -> C
     return replace(controller, law=law, reads=reads, outer=None, design=(shown, values), achieved=figures)
 
 
-def enclose_ticks(enclosed: Controller, controller: Controller, ticks: Ticks) -> Ticks:
-    """Return the ticks of a controller as those of its law with the outer loop in it."""
+def enclose_ticks(enclosed: Controller, ticks: Ticks) -> Ticks:
+    """Return the ticks of a force law as those of its law with the outer loop in it."""
     from scipy.signal import lfilter  # deferred: 0.3 s
 
-    assert ticks.given is not None and controller.outer is not None and enclosed.design is not None
+    assert ticks.given is not None
     given, position = ticks.given.T
-    kept = keep_share(find_position(enclosed.design[0], controller.outer) or "")
+    kept = keep_share(enclosed.signals[-1])
     if kept < 1.0:  # a link that nothing holds, whose place drifts
         position = np.asarray(lfilter([1.0, -1.0], [1.0, -kept], position - position[0]))
-    reads_it = len(enclosed.signals) == len(controller.signals)
+    reads_it = len(enclosed.signals) == ticks.measured.shape[1]
     measured = ticks.measured if reads_it else np.column_stack([ticks.measured, position])
     beside = {name: part for name, part in ticks.beside.items() if name not in enclosed.signals}
     return replace(ticks, reference=given, measured=measured, beside=beside, rendered=None, given=None)

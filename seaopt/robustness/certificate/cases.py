@@ -163,11 +163,9 @@ def ask(checks: Sequence[Check], survey: Survey, progress: Progress) -> Evidence
     rows, remarks = list[Requirement](), list[str]()
     for check, part in zip(asked, divide(progress, *(check.seconds(survey) for check in asked)), strict=True):
         evidence = check.measure(survey, part)
-        said = [evidence.risk if row.risk is None else row.risk for row in evidence.requirements]
-        rows += (
-            replace(row, place=row.place or survey.place, scope=evidence.scope, risk=risk)
-            for row, risk in zip(evidence.requirements, said, strict=True)
-        )
+        for row in evidence.requirements:
+            risk = evidence.risk if row.risk is None else row.risk
+            rows.append(replace(row, place=row.place or survey.place, scope=evidence.scope, risk=risk))
         remarks += evidence.remarks
         survey = replace(survey, found={**survey.found, **evidence.fields})
     return Evidence(requirements=rows, fields=survey.found, remarks=tuple(remarks))

@@ -22,8 +22,8 @@ SPECTRAL_RADIUS = "spectral_radius"  # of which a plant that is unstable fails
 LIMIT_CYCLE = "limit_cycle"
 UNSTABLE_LOOP = "the loop is UNSTABLE"
 DESIGN_PLANT = "design plant"  # whose own limits are judged
-# Of which plants a check speaks: at the nominal parameters, at draws of them, at all of a range, those that were
-# measured, or runs that were simulated; "" in an older file.
+# Of which plants a check speaks: at the nominal parameters, at draws of them, those that were measured, or runs that
+# were simulated; "" in an older file.
 CheckScope = Literal["", "nominal", "drawn", "measured", "simulated"]
 
 
