@@ -28,7 +28,7 @@ from seaopt.machine.acceptance import take_ranges
 from seaopt.machine.bringup.files import write_stage
 from seaopt.machine.bringup.page import write_bring_up_page
 from seaopt.machine.bringup.stages import BRINGUP_SCHEMA, FULL, OF_A_STAGE, slow_down
-from seaopt.machine.page import write_acceptance_page
+from seaopt.machine.page.page import write_acceptance_page
 from seaopt.machine.response.periods import Played
 from seaopt.machine.stepped import Source
 from seaopt.problem import Problem, certify_problem, tune_problem

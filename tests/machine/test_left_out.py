@@ -11,7 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.control import PlausibilityGate, runnable
 from seaopt.files import to_json
-from seaopt.machine.page import write_acceptance_page
+from seaopt.machine.page.page import write_acceptance_page
 from seaopt.machine.response.periods import Played, shorten
 from seaopt.machine.ticks import take_ticks
 from tests.machine.simulator import Bench, Machine, multisine

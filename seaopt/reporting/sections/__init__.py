@@ -35,7 +35,7 @@ KINDS = {
     "Fleet": "seaopt.fleet.page",
     "Drift": "seaopt.fleet.page",
     "Population": "seaopt.fleet.page",
-    "Acceptance": "seaopt.machine.page",
+    "Acceptance": "seaopt.machine.page.page",
     "BringUp": "seaopt.machine.bringup.page",
 }
 

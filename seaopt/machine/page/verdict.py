@@ -1,0 +1,162 @@
+"""The verdict on an acceptance: what is met, and why not."""
+
+from __future__ import annotations
+
+from seaopt.formatting import format_count, format_number, join_words
+from seaopt.machine.acceptance import EXPLAINED, Acceptance
+from seaopt.machine.differences.certified import Differences
+from seaopt.machine.replay import Replay
+from seaopt.machine.response.verdicts import LEAST_PHASES, Judged, Response
+from seaopt.machine.wording import say_cause, say_difference, say_missing, say_status, say_trip
+from seaopt.reporting.sections.data import Commands, Reason, Step, Style, Verdict
+from seaopt.units import unit_after
+
+OUTCOMES: dict[str, Style] = {"confirmed": "good", "refuted": "bad", "undecided": "warning"}
+MISSED = (
+    "no cause was found: are these the logs of this problem, and was the C code exported from this controller.json?"
+)
+PARTLY = "which explains {} of the difference: more than that differs, and its size may be another one beside it"
+NO_UNIT = (
+    "the column of the reference states no unit: write [{}] in its header if it is x_0, which the outer loop was "
+    "given, or [{}] if it is what the law was given, and judge again"
+)
+UNCERTIFIED = {
+    "missing": "not certified: there is no certificate of this law",
+    "failed": "not certified: the certificate of this law FAILED",
+}
+
+
+def judge(result: Acceptance, commands: Commands) -> Verdict | None:
+    """Return the verdict on an acceptance."""
+    off = [(source, row) for source, row in zip(result.sources, result.replays, strict=True) if not row.met]
+    reasons = [Reason(what=_say_mismatch(row, result), where=source) for source, row in off]
+    trips = zip(result.sources, result.replays, strict=True)
+    reasons += [Reason(what=say_trip(result.controller, row.trip), where=source) for source, row in trips if row.trip]
+    count = format_count(len(result.sources), "log")
+    parts = [f"the law makes the logged command in {len(result.sources) - len(off)} of {count}"]
+    reported = zip(result.sources, result.reported, result.replays, strict=True)
+    reasons += [
+        Reason(what=say_status(each, row), where=source) for source, each, row in reported if each and each.contradicts
+    ]
+    response, differences = result.response, result.differences
+    if response is not None:
+        limited = [row for row in response.judged if row.limit is not None]
+        counts = {outcome: sum(row.outcome == outcome for row in limited) for outcome in OUTCOMES}
+        parts.append(f"{counts['confirmed']} of {len(limited)} limits confirmed, {counts['refuted']} refuted")
+        if response.still:
+            parts.append("dry friction held the motor, so that they are of the stuck machine alone")
+        reasons += [Reason(what=_say_refuted(row)) for row in limited if row.outcome == "refuted"]
+        if counts["undecided"]:
+            reasons.append(Reason(what=f"the log does not decide {say_undecided(result, response)}"))
+    if differences is not None and not differences.inside:
+        parts.append(say_inside(result, differences))
+        first = response is not None and response.rate != 1.0  # by which all figures are other ones
+        reasons.insert(0 if first else len(reasons), Reason(what=_say_best(differences)))
+    if result.stepped is not None:
+        reasons.append(Reason(what=say_difference(result.stepped)))
+    if result.certificate in UNCERTIFIED:
+        parts.append("the law is not certified")
+        reasons.append(Reason(what=UNCERTIFIED[result.certificate], where=", ".join(result.broken)))
+    if response is None and result.replayed:
+        reasons += [Reason(what=f"no response: {text}") for text in result.left_out.values()]
+    missing = result.certificate == "missing" and commands.certify
+    steps = (Step(text="certify the law:", copied=(commands.certify,)),) if missing else ()
+    return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons), next=steps)
+
+
+def say_inside(result: Acceptance, differences: Differences) -> str:
+    """Return whether the machine is one of those that were certified, or else of what it was compared with."""
+    no = "" if differences.inside else "not "
+    if result.certificate == "met":
+        return f"the machine is {no}one of those that were certified"
+    model = "the plant of the link" if result.enclosed else "the design plant"
+    given = "within the uncertainty that was given" if differences.nearest else model
+    return f"the machine is {no}{given}"
+
+
+def _say_best(differences: Differences) -> str:
+    """Return what explains best that the machine is another one, those that the log does not tell apart, and whether
+    more than that is there.
+    """
+    if not differences.found:
+        return "its response is another one"
+    best, *others = differences.found
+    said = "; or ".join(map(say_difference, (best, *(each for each in others if each.untold))))
+    return said if best.explains >= EXPLAINED else f"{said}, {PARTLY.format(f'{100.0 * best.explains:.0f} %')}"
+
+
+def name_figure(row: Judged) -> str:
+    """Return the name of a figure, with the state of the machine that its limit is of."""
+    return f"{row.name}, {row.state}" if row.state else row.name
+
+
+def _say_refuted(row: Judged) -> str:
+    if row.name == "stability":
+        return "stability is refuted"
+    limit = f"{name_figure(row)} {row.sense} {format_number(row.limit)}{unit_after(row.unit)} is refuted"
+    at = "" if row.where_hz is None else f" at {format_number(row.where_hz, 3)} Hz"
+    return f"{limit}: {format_number(row.value, 3)} ({show_interval(row)}){at}"
+
+
+def say_undecided(result: Acceptance, response: Response) -> str:
+    """Return of which limits a log does not say enough, and what to record so that it does."""
+    rows = [row for row in response.judged if row.limit is not None and row.outcome == "undecided"]
+    if response.rate != 1.0:  # of these lines no more is needed: they are others once the timer is right
+        return f"{join_words([name_figure(row) for row in rows])}: record again once the law is stepped at its rate"
+    # a loop that is mended is another one, which other periods decide
+    refuted = any(row.limit is not None and row.outcome == "refuted" for row in response.judged)
+    near = [] if refuted else [_say_near(row) for row in rows if row.near is not None]
+    rows = rows if refuted else [row for row in rows if row.near is None]
+    tripped = any(row.trip is not None for row in result.replays)
+    record: list[str] = ["all of the reference again, without a trip of the gate"] if tripped else []
+    if response.needs_phases and not tripped:
+        below = (
+            " and with the command below its limit" if any(part.left_out.limit for part in response.measured) else ""
+        )
+        record.append(f"{LEAST_PHASES} sets of random phases{below}, which dry friction asks for")
+    if response.needs_lines is not None:
+        record.append(say_missing(response.needs_lines, response.missing))
+    periods = 0 if tripped or refuted else max((row.periods or 0 for row in rows), default=0)
+    if periods:
+        record.append(f"{periods} periods in all ({format_number(periods * response.period_s, 3)} s)")
+    wanted = join_words(record) or ("again" if refuted else "more periods, or a larger reference")
+    first = "mend what is refuted first, then " if refuted else ""
+    others = [f"{join_words([name_figure(row) for row in rows])}: {first}record {wanted}"] if rows else []
+    return "; ".join([*others, *near])
+
+
+def _say_near(row: Judged) -> str:
+    """Return that a figure lies at its limit."""
+    unit, value, near = unit_after(row.unit), format_number(row.value, 4), format_number(100.0 * (row.near or 0.0), 2)
+    return (
+        f"{name_figure(row)}: the estimate, {value}{unit}, is within {near} % of the limit as judged, "
+        f"{format_number(row.limit, 4)}{unit}, so that no record of sensible length decides (over an "
+        "hour); play a larger reference, or ask for less or tune for more of it"
+    )
+
+
+def show_interval(row: Judged) -> str:
+    """Return the interval of a figure."""
+    return f"{format_number(row.low, 3, 'none')} to {format_number(row.high, 3, 'none')}"
+
+
+def _say_mismatch(row: Replay, result: Acceptance) -> str:
+    said, outer = _say_off(row, result), result.controller.outer
+    if not row.unit_missing or outer is None:
+        return said
+    return f"{NO_UNIT.format(outer.place_unit, result.controller.command.reference_unit)}; {said}"
+
+
+def _say_off(row: Replay, result: Acceptance) -> str:
+    unit = unit_after(result.controller.command.unit)
+    if row.undecided or (row.causes and row.causes[0].explains):
+        return say_cause(row.causes[0])
+    off = f"the command is off by {format_number(row.mismatch, 3)}{unit} (rms), of {format_number(row.rms, 3)}{unit}"
+    if row.ticks_per_row > 1:
+        off = f"{off}, or lines of the reference lie above half of the log's rate"
+    if not row.causes:
+        return f"{off}; {MISSED}"
+    first, *others = row.causes
+    if others and others[0].besides and others[0].explains:
+        return f"{say_cause(first)}, and {say_cause(others[0])}"
+    return f"{off}; nearest: {say_cause(first)} ({100.0 * first.removes:.0f} % of it)"
