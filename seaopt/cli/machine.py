@@ -263,9 +263,8 @@ def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[st
 def write_again(result: Acceptance, session: Session) -> list[Path]:
     """Write the logs that are of the law as a fit takes them, and the tables of their experiments."""
     problem, folder, files, text = session.problem, session.folder / AGAIN, list[Path](), TABLES
-    plant = problem.design_plant
-    name = next(name for name, each in problem.plants.items() if each is plant)
-    for number, log in enumerate(result.experiments, start=1):
+    for number, (plant, log) in enumerate(result.experiments, start=1):
+        name = next(name for name, each in problem.plants.items() if each is plant)
         stem = re.sub(r"\W+", "_", Path(log.source).stem) or "log"
         label = f"{stem}_under_law" if len(result.experiments) == 1 else f"{stem}_under_law_{number}"
         files.append(write_log(log, folder / f"{label}.csv"))

@@ -86,6 +86,9 @@ class Acceptance(Result, Worded):
         tells that it is another than that of the log's clock.
     enclosed : bool
         Whether the response is that of the loop with the law's outer loop in it, on the plant of its link.
+    experiments : tuple of (Plant, Log)
+        The logs that are of the law, for a fit: what was on the bench, and a row per tick with the command that was in
+        force and what was read. Of one in which the outer loop ran that is the plant of its link.
     certificate : {"met", "failed", "missing"} or None
         Of the law; None where nothing is known of one, as in `accept`. Without one that is met the law is not accepted.
     broken : tuple of str
@@ -102,7 +105,7 @@ class Acceptance(Result, Worded):
     gaps: tuple[Gaps | None, ...] = ()
     reported: tuple[Reported | None, ...] = ()
     stepped: Difference | None = None
-    experiments: tuple[Log, ...] = ()
+    experiments: tuple[tuple[Plant, Log], ...] = ()
     enclosed: bool = False
     certificate: Literal["met", "failed", "missing"] | None = None
     broken: tuple[str, ...] = ()
@@ -273,9 +276,9 @@ def accept(
         place = controller.over, rows[0].middle, controller.unit
     sources = tuple(log.source for log in logs)
     experiments = tuple(
-        replace(make_experiment(law, ticks, row.command_late), law=_hash(controller))
+        (plant, replace(make_experiment(law, plant, ticks, row.command_late), law=_hash(controller)))
         for ticks, row in zip(map(_end_at_trip, rows, (row.trip for row in replays)), replays, strict=True)
-        if row.met and _shows_machine(ticks, row)
+        if row.met and _has_commands(ticks, row) and (plant := _find_plant(law, ticks, link)) is not None
     )
     result = Acceptance(
         controller=law,
@@ -314,7 +317,7 @@ def accept(
             left_out[ticks.source] = str(error) if row.trip is None else TRIPPED
     if not blocks:
         pairs = zip(rows, replays, strict=True)
-        told = [find_rate(law, ticks) for ticks, row in pairs if _shows_machine(ticks, row)]
+        told = [find_rate(law, ticks) for ticks, row in pairs if ticks.rendered is None and _has_commands(ticks, row)]
         stepped = next((each for each in told if each is not None), None)
         kept = () if stepped is not None else result.experiments  # whose clock is wrong
         return replace(result, left_out=left_out, stepped=stepped, experiments=kept)
@@ -342,9 +345,15 @@ def _take_whole(source: Source, log: Log, ticks: Ticks, row: Replay, reference: 
     return ticks.move_command(row.command_late) if row.command_late else ticks
 
 
-def _shows_machine(ticks: Ticks, row: Replay) -> bool:
-    """Tell whether a log has what the machine made of each command; behind an outer loop is another plant."""
-    return row.ticks_per_row == 1 and ticks.rendered is None and len(ticks) >= FEWEST
+def _has_commands(ticks: Ticks, row: Replay) -> bool:
+    """Tell whether a log has each command, and what the machine made of it."""
+    return row.ticks_per_row == 1 and len(ticks) >= FEWEST
+
+
+def _find_plant(law: Controller, ticks: Ticks, link: tuple[Plant, ParameterSet] | None) -> Plant | None:
+    """Return the plant that a log is of: where the outer loop ran, that of its link. None where that is not known."""
+    found = law.design if ticks.rendered is None else link
+    return None if found is None else found[0]
 
 
 def _end_at_trip(ticks: Ticks, trip: Trip | None) -> Ticks:
@@ -418,19 +427,24 @@ def require_still(source: Source, ticks: Ticks) -> Ticks:
     return ticks
 
 
-def make_experiment(controller: Controller, ticks: Ticks, late: int) -> Log:
-    """Return a log whose rows have the command that is in force there. `late`: rows by which it is logged late."""
-    moved = ticks.move_command(late - controller.spec.loop_delay_samples)
-    names, command = (*controller.signals, *controller.further), controller.command
-    table = np.column_stack([moved.measured, moved.further])
-    columns = {name: table[:, i] for i, name in enumerate(names)} | {command.input: moved.command}
-    outputs = {} if controller.design is None else controller.see(controller.design[0]).outputs
-    units = {name: outputs.get(name, "") for name in names} | {command.input: command.unit}
+def make_experiment(controller: Controller, plant: Plant, ticks: Ticks, late: int) -> Log:
+    """Return a log of a plant whose rows have the command that is in force there. `late`: rows by which it is logged
+    late.
+    """
+    moved, command = ticks.move_command(late - controller.spec.loop_delay_samples), controller.command
+    names = (*controller.signals, *controller.further)
+    columns = dict(zip(names, np.column_stack([moved.measured, moved.further]).T, strict=True))
+    columns |= {name: part for name, part in moved.beside.items() if name in plant.outputs}
+    if controller.outer is not None and moved.given is not None:
+        columns[controller.outer.position] = moved.given[:, 1]
+    outputs = controller.see(plant).outputs
+    units = {name: outputs.get(name, "") for name in columns} | {command.input: command.unit}
     return Log.from_arrays(
         time=np.arange(len(moved)) / ticks.rate_hz,
         units={name: unit or "-" for name, unit in units.items()},
         source=ticks.source,
         **columns,
+        **{command.input: moved.command},
     )
 
 

@@ -99,7 +99,7 @@ def test_a_gate_that_tripped_is_named_with_when_and_the_log_ends_before_it(compi
     assert told["at_s"] == pytest.approx(1e-3 * (first + 3)) and told["stopped_s"] == pytest.approx(10.0 - told["at_s"])
     (part,) = record["response"]["measured"]
     assert part["periods"] == 5 and part["left_out"] == {"limit": 0, "gate": 0, "gap": 0}
-    (experiment,) = result.experiments
+    ((_, experiment),) = result.experiments
     assert first - 2 <= len(experiment) <= first and experiment["F1"][-1] == log["F1"][first - 1]
     says = f"the gate tripped at {1e-3 * (first + 3):.3f} s, of 4 readings in a row outside its range, -1500 to 1500 N"
     assert says in terminal and says in page and "the law was stopped for the rest" in terminal

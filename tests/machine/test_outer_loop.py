@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.linalg
+from typer.testing import CliRunner
 
 import seaopt as so
+from seaopt.cli.main import app
 from seaopt.control import Impedance, add_impedance, tune_schedule
 from seaopt.machine.design_run import run_design
 from tests.machine.simulator import Bench, Machine, multisine
@@ -149,7 +152,7 @@ def test_damping_alone_is_replayed_of_the_force_before_it_and_after(damping):
     result = so.accept(damping, [before, after, make_log(rows, inner=True)])
     for row in result.replays:
         assert row.met and row.mismatch < 1e-3 * row.rms, row
-    assert len(result.experiments) == 2  # before the damping it is another plant
+    assert len(result.experiments) == 2  # before the damping it is of the link's plant, which was not given
 
 
 def test_another_damping_alone_is_named(damping):
@@ -227,6 +230,49 @@ def test_the_whole_loop_of_a_right_machine_is_met_and_is_its_margin_at_the_comma
     loop = -law.per_effort * (inner[:, 1] * torque + inner[:, 0] * outer) / z  # a command waits for the next tick
     assert figures["Ms"].value == pytest.approx(np.max(1.0 / np.abs(1.0 + loop)), rel=0.02)
     assert figures["Ms"].predicted == pytest.approx(np.max(1.0 / np.abs(1.0 + loop)), rel=1e-3)
+
+
+def test_a_log_under_an_impedance_is_an_experiment_of_its_link(impedance):
+    """A fit of it finds what the test's own machine was made of, from values that are off."""
+    knee, values = take_link()
+    log = make_log(run(impedance, excite(20.0, 7)))
+    result = so.accept(impedance, [log], link=(knee, values))
+    ((plant, recorded),) = result.experiments
+    assert plant is knee and {"I", "tau_s", "theta_l"} <= set(recorded.signals)
+    again = so.Experiment(plant=plant, log=recorded, feedback=True)
+    start = values.update(eta=0.6, J_l=0.4, d_l=1.5).free("eta", "J_l", "d_l")
+    fit = so.fit([again], start, method=so.PredictionError())
+    so.testing.assert_recovered(fit, {"eta": KNEE["eta"], "J_l": INERTIA, "d_l": DAMPER}, sigmas=4)
+    assert fit.parameters["eta"].std < 0.02 * KNEE["eta"]
+
+
+PROBLEM = """
+schema = 1
+title = "Knee"
+parameters = { N = 100, K_tau = 0.0369, eta = 0.7, J_m = 2.4e-5, b_r = 1e-4, k_s = 300.0, J_l = 0.5, d_l = 2.0 }
+plant = { stand = { kind = "rotary", link = "locked" }, knee = { kind = "rotary" } }
+controller = { plant = "stand", measured = "tau_s", bandwidth_hz = 20, current_limit_A = 9.0, max_noise_gain = 45 }
+impedance = { plant = "knee", stiffness = 20.0, damping = 1.0, velocity_filter_s = 0.005 }
+robustness = { plants = ["knee"], samples = 5 }
+"""
+
+
+def test_the_command_writes_it_as_an_experiment_of_the_links_plant(tmp_path):
+    """The problem with the tables that are written reads back, and a fit with them starts."""
+    (tmp_path / "knee.toml").write_text(PROBLEM)
+    call, options = CliRunner().invoke, [str(tmp_path / "knee.toml"), "-o", str(tmp_path / "out")]
+    assert call(app, ["tune", *options]).exit_code == 0
+    problem = so.read_problem(tmp_path / "knee.toml")
+    content = json.loads((tmp_path / "out" / "controller.json").read_text())
+    law = so.Controller.from_dict(content, problem.design_plant, problem.values(problem.parameters))
+    so.write_log(make_log(run(law, excite(20.0, 7))), tmp_path / "running.csv")
+    done = call(app, ["accept", options[0], str(tmp_path / "running.csv"), *options[1:]])
+    assert "experiments.toml" in done.output, done.output
+    tables = (tmp_path / "out" / "again" / "experiments.toml").read_text()
+    assert 'plant = "knee"' in tables and 'theta_l = "theta_l [rad]"' in tables
+    (tmp_path / "knee.toml").write_text(PROBLEM + tables)
+    (experiment,) = so.read_problem(tmp_path / "knee.toml").experiments()
+    assert experiment.feedback and {"tau_s", "theta_l"} <= set(experiment.outputs)
 
 
 def test_what_is_simulated_has_the_outer_loop(impedance, monkeypatch):
