@@ -252,10 +252,14 @@ def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[st
     command = spell_call()
     content = _describe(result, session) | {"problem": session.problem.source}
     write_json(session.folder / FILE, content)
-    files = [Path(session.problem.source), *logs]
-    title = f"Acceptance: {session.problem.title}"
     write_acceptance_page(
-        result, session.folder / PAGE, title=title, files=files, command=command, fit_met=session.fit_met()
+        result,
+        session.folder / PAGE,
+        title=f"Acceptance: {session.problem.title}",
+        files=[Path(session.problem.source)],
+        logs=logs,
+        command=command,
+        fit_met=session.fit_met(),
     )
     return content
 

@@ -52,7 +52,7 @@ OUTER_LOOP = (
 WITH_OTHERS = "an outer loop was closed around the law, and not in other logs; judge logs with it by themselves"
 OTHER_LAW = "the logs are not of this law; mend that first, then record again"
 TRIPPED = "the gate tripped before the reference had repeated often enough; record all of it again"
-UNTOLD_LAW = "the logs do not tell whether they are of this law"
+UNTOLD_LAW = "the logs do not tell whether they are of this law; record what would tell, as is said of each"
 ACCEPTANCE_SCHEMA = "seaopt/acceptance/1"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -232,3 +233,35 @@ def test_stretches_are_said_with_how_their_states_are_found(controller, bench, t
     terminal, page, record = read_everywhere(result, tmp_path)
     says = "3 stretches without, of 9998 ticks in all, each from a state that its own first rows tell"
     assert says in terminal and says in page and record["replay"]["logs"][0]["stretches"] == 3
+
+
+def read_section(page, name):
+    """Return the text of a section of a page, without its heading."""
+    (found,) = re.findall(rf'<section id="{name}".*?</h2>(.*?)</section>', page, flags=re.DOTALL)
+    return " ".join(re.sub(r"<[^>]*>", " ", found).split())
+
+
+def test_a_page_without_a_response_says_why_and_what_to_record(controller, bench, tmp_path):
+    log = bench.log(Machine(), REFERENCE[: 2 * PERIOD])
+    result = so.accept(controller, [log])
+    terminal, page, _ = read_everywhere(result, tmp_path)
+    section = read_section(page, "response")
+    assert section.startswith("No response") and "1 whole period of 1 s" in section, section
+    assert "at least 3 periods" in section and terminal.count("at least 3 periods") == 1
+    half = so.Log.from_arrays(time=log.time, source="bench", reference=log["reference"], F1=log["F1"], I=0.5 * log["I"])
+    section = read_section(read_everywhere(so.accept(controller, [half]), tmp_path)[1], "response")
+    assert "not of this law; mend that first, then record again" in section
+    assert read_section(
+        read_everywhere(so.accept(controller, [bench.log(Machine(), REFERENCE)]), tmp_path)[1], "response"
+    )
+
+
+def test_a_page_tells_the_problem_file_from_the_logs(controller, bench, tmp_path):
+    names = {"actuator.toml": "problem file", "first.csv": "log", "second.csv": "log"}
+    files = [tmp_path / name for name in names]
+    for file in files:
+        file.write_text(file.name)
+    result = so.accept(controller, [bench.log(Machine(), REFERENCE[: 2 * PERIOD])])
+    page = write_acceptance_page(result, tmp_path / "page.html", files=files[:1], logs=files[1:]).read_text()
+    rows = re.findall(r"<td[^>]*>([^<]*)</td>\s*<td[^>]*>([^<]*)</td>\s*<td[^>]*>[0-9a-f]{64}</td>", page)
+    assert {file.rpartition("/")[2]: use for file, use in rows} == names

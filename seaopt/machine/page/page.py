@@ -203,6 +203,21 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks), items=items)
 
 
+def _tell_missing(result: Acceptance) -> list[Section]:
+    """Return the section of a response that is not there: why, and what to record. A text says that in its verdict."""
+    if result.response is not None:
+        return []
+    told = [] if result.stepped is None else [say_difference(result.stepped)]
+    told += result.left_out.values()
+    told += [
+        f"{source}: {say_cause(row.causes[0])}"
+        for source, row in zip(result.sources, result.replays, strict=True)
+        if row.undecided
+    ]
+    items = tuple(Item(severity="warning", text=text) for text in told)
+    return [Section(title="No response", part="response", items=items)]
+
+
 def _warn_left_out(part: Measured) -> Item:
     """Return how many periods are not used, why, and what to do."""
     total, why = part.left_out.total, "; ".join(say_left_out(part.left_out))
@@ -399,6 +414,7 @@ def write_acceptance_page(
     *,
     title: str = "Acceptance",
     files: Sequence[Path | str] = (),
+    logs: Sequence[Path | str] = (),
     command: str = "",
     fit_met: bool = True,
 ) -> Path:
@@ -413,7 +429,9 @@ def write_acceptance_page(
     title : str
         Heading of the page.
     files : sequence of path
-        What it was made of: the problem file and the logs.
+        The problem file.
+    logs : sequence of path
+        The logs that were judged.
     command : str
         What was typed to make it, to be stated.
     fit_met : bool
@@ -431,7 +449,7 @@ def write_acceptance_page(
         verdict=judge(result, Commands()),
         fit_met=fit_met,
         glance=summarise(result),
-        sections=[*describe(result), describe_provenance((), files, command)],
+        sections=[*describe(result), *_tell_missing(result), describe_provenance((), files, command, logs)],
         plates={
             "response": [{"heading": "", "text": "", "charts": [make_chart(panel) for panel in list_panels(result)]}]
         },

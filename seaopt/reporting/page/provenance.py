@@ -16,8 +16,12 @@ from seaopt.reporting.sections.data import Section, Table
 PACKAGES = {name: name for name in ("numpy", "scipy", "casadi", "matplotlib")} | {"python-control": "control"}
 
 
-def describe_provenance(experiments: Iterable[Experiment], files: Sequence[Path | str], command: str) -> Section:
-    """Return what a report made now is made with, and of which files: those of `experiments`' logs, and `files`."""
+def describe_provenance(
+    experiments: Iterable[Experiment], files: Sequence[Path | str], command: str, logs: Sequence[Path | str] = ()
+) -> Section:
+    """Return what a report made now is made with, and of which files: problem `files`, `logs`, and those of the logs of
+    `experiments`.
+    """
     rows = [
         ("written", datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")),
         ("command", command),
@@ -26,7 +30,7 @@ def describe_provenance(experiments: Iterable[Experiment], files: Sequence[Path 
         ("libraries", ", ".join(f"{name} {version(package)}" for name, package in PACKAGES.items())),
         ("machine", f"{platform.platform()}, {platform.machine()}, {os.cpu_count() or 1} processors"),
     ]
-    sources = (*_hash_files(files), *_list_logs(experiments))
+    sources = (*_hash_files(files, "problem file"), *_hash_files(logs, "log"), *_list_logs(experiments))
     return Section(
         title="What made this report",
         part="provenance",
@@ -38,10 +42,10 @@ def describe_provenance(experiments: Iterable[Experiment], files: Sequence[Path 
     )
 
 
-def _hash_files(files: Sequence[Path | str]) -> Iterator[tuple[str, ...]]:
+def _hash_files(files: Sequence[Path | str], use: str) -> Iterator[tuple[str, ...]]:
     for file in map(Path, files):
         if file.is_file():
-            yield str(file), "problem file", hashlib.sha256(file.read_bytes()).hexdigest()
+            yield str(file), use, hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def _list_logs(experiments: Iterable[Experiment]) -> list[tuple[str, ...]]:
