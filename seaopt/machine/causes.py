@@ -21,6 +21,7 @@ from seaopt.errors import SeaoptError
 from seaopt.machine.gains.edited_table import Edit, list_edits
 from seaopt.machine.gains.free_gains import find_same, fit_gains, make_law, read_gains
 from seaopt.machine.stepped import (
+    SAME_PLACE,
     Match,
     Others,
     Setting,
@@ -463,6 +464,46 @@ def _list_places(setting: Setting) -> Iterator[Alternative]:
         change = _change_ticks(lambda rows, factor=factor: _scale_place(rows, factor))
         kind = "sign" if factor < 0.0 else "unit"
         yield Alternative(kind=kind, what=over, value=factor, change=change)
+
+    if (shift := _fit_place(setting)) is not None:
+        change = _change_ticks(lambda rows: _shift_place(rows, shift))
+        still = np.ptp(place) <= SAME_PLACE * (points[-1] - points[0])
+        kind, value = ("place", float(np.median(place)) + shift) if still else ("shift", shift)
+        yield Alternative(kind=kind, what=over, value=value, unit=law.table.unit, change=change)
+
+
+def _fit_place(setting: Setting) -> float | None:
+    """Return what is to be added to where a schedule's variable was logged, for the commands that are nearest to the
+    logged ones; None where no law runs so. The gains are on lines between the points: looked at are these and the
+    middles between them, then the neighbourhood of the best.
+    """
+    from scipy.optimize import minimize_scalar  # deferred: 0.2 s
+
+    law, place = setting.law, setting.ticks.place
+    assert isinstance(law, RunnableSchedule) and place is not None
+
+    def leaves(shift: float) -> float:
+        try:
+            energy = play(replace(setting, ticks=_shift_place(setting.ticks, shift))).energy
+        except SeaoptError:
+            return math.inf
+        return energy if math.isfinite(energy) else math.inf
+
+    points = law.table.points
+    grid = np.sort([*points, *(0.5 * (points[1:] + points[:-1]))]) - np.median(place)
+    rated = [leaves(shift) for shift in grid.tolist()]
+    best = int(np.argmin(rated))
+    if not math.isfinite(rated[best]):
+        return None
+    ends = grid[[max(best - 1, 0), min(best + 1, grid.size - 1)]]
+    found = minimize_scalar(
+        leaves, bounds=tuple(ends.tolist()), method="bounded", options={"xatol": 1e-7 * np.ptp(ends)}
+    )
+    return float(found.x)
+
+
+def _shift_place(ticks: Ticks, shift: float) -> Ticks:
+    return replace(ticks, place=None if ticks.place is None else shift + ticks.place)
 
 
 def _scale_place(ticks: Ticks, factor: float) -> Ticks:

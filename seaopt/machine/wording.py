@@ -91,6 +91,8 @@ def say_cause(cause: Cause) -> str:
             return f"the feedforward of the {cause.what} is missing or another one"
         case "place":
             return f"the law was given {value}{unit_after(cause.unit)} as {cause.what}"
+        case "shift":
+            return f"the law was given {cause.what} with {value}{unit_after(cause.unit)} added to what was logged"
         case "compensation":
             return f"the compensation of {cause.what} is missing"
         case "part":

@@ -91,6 +91,28 @@ def test_a_schedule_that_was_given_another_place_is_named(schedule, scheduled, g
     assert (row.causes[0].kind, row.causes[0].what, row.causes[0].value) == (kind, "k", value)
 
 
+@pytest.mark.parametrize("decimals", [3, None])
+def test_a_schedule_that_was_given_a_value_between_its_points_is_named_with_it(schedule, scheduled, decimals):
+    log = scheduled.log(SOFT, REFERENCE, places=np.full(REFERENCE.size, 6.2e5), decimals=decimals)
+    (row,) = so.accept(schedule, [replace_place(log, np.full(REFERENCE.size, 6.5e5))]).replays
+    cause = row.causes[0]
+    assert cause.kind == "place" and cause.explains and cause.value == pytest.approx(6.2e5, rel=1e-3), row
+    assert not row.met and f"the law was given {cause.value:.4g} N/m as k" in say_cause(cause)
+
+
+def test_a_moving_variable_that_was_logged_with_an_offset_is_named_with_it(schedule, scheduled):
+    places = 6.4e5 + 1e5 * np.sin(2e-3 * np.arange(REFERENCE.size))
+    log = scheduled.log(SOFT, REFERENCE, places=places, decimals=3)
+    (row,) = so.accept(schedule, [replace_place(log, places - 3e4)]).replays
+    cause = row.causes[0]
+    assert cause.kind == "shift" and cause.explains and cause.value == pytest.approx(3e4, rel=1e-2), row
+    assert "N/m added to what was logged" in say_cause(cause)
+
+
+def replace_place(log, places):
+    return so.Log.from_arrays(**{name: log[name] for name in ("reference", "I", "F1")}, time=log.time, k=places)
+
+
 def test_a_schedule_at_exactly_zero_is_not_taken_at_its_fallback(schedule):
     zeros = np.zeros(100)
     columns = dict.fromkeys(("reference", "command", "place"), zeros)
