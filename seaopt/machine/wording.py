@@ -141,9 +141,10 @@ def say_status(reported: Reported, row: Replay) -> str:
 def say_bias(bias: Bias) -> str:
     """Return how far off the plant would be without the reference."""
     most, where = format_number(100.0 * bias.largest, 2), format_number(bias.where_hz, 3)
+    why = ", as noise goes round the loop" if bias.by_noise else ""
     return (
-        f"Taken from command and readings alone, the plant would be off by up to {most} % (at {where} Hz), as noise "
-        "goes round the loop; here all is taken from the reference."
+        f"Taken from command and readings alone, the plant would be off by up to {most} % (at {where} Hz){why}; here "
+        "all is taken from the reference."
     )
 
 

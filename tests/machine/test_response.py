@@ -415,7 +415,7 @@ def test_margins_of_a_loop_that_crosses_a_gain_of_one_three_times(controller):
         }
         ratio = Ratio(numerator=np.tile(loop, (2, 1)), denominator=np.ones((2, f.size)) + 0j)
         counts = {"periods": 2, "blocks": 2, "phases": 1, "amplitude": 1.0, "left_out": LeftOut()}
-        part = Measured(f=f, loop=ratio, tracking=ratio, outputs={"F1": ratio}, direct=loop, **counts)
+        part = Measured(f=f, loop=ratio, tracking=ratio, outputs={"F1": ratio}, direct=loop, by_noise=loop, **counts)
         rows = {row.name: row.value for row in list_margins(controller, [part], 0.05)}
         assert gain != 9.0 or np.isclose(rows["phase margin"], 61.68, atol=0.05)  # the others are -125 and 64 degrees
         assert rows.keys() == truth.keys()

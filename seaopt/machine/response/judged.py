@@ -43,6 +43,7 @@ class Bias:
     lines: int
     largest: float  # of the plant's size
     where_hz: float  # of the largest
+    by_noise: bool  # whether noise that goes round the loop makes all of it
 
 
 @record(eq=False)
@@ -59,6 +60,7 @@ class Measured:
     amplitude: float
     left_out: LeftOut
     direct: Complex[np.ndarray, " m"]  # the plant from command and readings alone, without the reference
+    by_noise: Complex[np.ndarray, " m"]  # what that is where only noise that goes round the loop biases it
 
     @property
     def plant(self) -> Ratio:
@@ -74,7 +76,13 @@ class Measured:
         at = int(np.argmax(off))
         if not off[at]:
             return None
-        return Bias(lines=int(np.count_nonzero(off)), largest=float(off[at]), where_hz=float(self.f[at]))
+        explained = np.abs(self.direct - self.by_noise) <= radius
+        return Bias(
+            lines=int(np.count_nonzero(off)),
+            largest=float(off[at]),
+            where_hz=float(self.f[at]),
+            by_noise=bool(np.all(explained[off > 0.0])),
+        )
 
     @property
     def distance(self) -> Complex[np.ndarray, " m"]:

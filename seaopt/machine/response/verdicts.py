@@ -5,7 +5,10 @@ U/R and what the law makes of the readings, :math:`V/R = \sum_i C_i Y_i/R`. Then
 line, however the noise goes round the loop. The tracking is Y/R itself. From U and Y alone, the direct estimate
 :math:`\sum \bar U_p Y_p / \sum |U_p|^2` tends to a mean of the plant and of -1/C, with the shares of U that the
 reference and the noise make (Forssell and Ljung, Automatica 35, 1999); it stands beside the plant, to show what noise
-does.
+does: with :math:`y_p` what differs from period to period of one set of phases, and
+:math:`u_p = c (z - A)^{-1} z\,x_p - \sum_i C_i y_{ip}` what the law makes of it, where its state is another by
+:math:`x_p` at the start of a period than at its end, it is
+:math:`(\hat G (\sum |U_p|^2 - \sum |u_p|^2) + \sum \bar u_p y_p) / \sum |U_p|^2` where nothing else biases it.
 
 With :math:`\hat L` of std s and the limit :math:`M_s`, at a risk :math:`\alpha` of a false statement:
 
@@ -32,7 +35,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from seaopt.control import Controller
 from seaopt.control.loops.loop import Loop
@@ -160,7 +163,27 @@ def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured
         left_out=blocks.left_out,
         direct=np.sum(np.conj(blocks.effort) * blocks.measured[:, 0], axis=0)
         / np.sum(np.abs(blocks.effort) ** 2, axis=0),
+        by_noise=_predict_direct(controller, blocks, np.mean(measured[:, 0], axis=0) / np.mean(effort, axis=0)),
     )
+
+
+def _predict_direct(
+    controller: Controller, blocks: Blocks, plant: Complex[np.ndarray, " m"]
+) -> Complex[np.ndarray, " m"]:
+    """Return what the direct estimate is of a plant where only noise that goes round the loop biases it."""
+    law, kinds, periods = controller.law, np.unique(blocks.realisation), len(blocks.reference)
+    read, effort = blocks.measured.copy(), blocks.effort.copy()
+    for rows in (blocks.realisation == kind for kind in kinds):
+        read[rows] -= read[rows].mean(axis=0)
+        effort[rows] -= effort[rows].mean(axis=0)
+    made = np.sum(law.responses(blocks.f)[1:] * read, axis=1)
+    z = np.exp(2j * np.pi * blocks.f * law.sample_time_s)
+    states = z[:, None] * np.linalg.solve(z[:, None, None] * np.eye(law.c.size) - law.a.T, law.c)
+    parts, left = (np.concatenate([each.real, each.imag]) for each in (states, (effort - made).T))
+    made += (states @ np.linalg.lstsq(parts, left)[0]).T
+    total = np.sum(np.abs(blocks.effort) ** 2, axis=0)
+    of_noise = np.sum(np.conj(made) * (read[:, 0] - plant * made), axis=0)
+    return plant + of_noise / total * (periods - 1) / max(periods - kinds.size, 1)
 
 
 def has_terms(controller: Controller) -> bool:
