@@ -267,6 +267,9 @@ class ExperimentTable(StrictTable):
     counter: CounterTable | None = key("A column that counts samples, which shows lost ones.", default=None)
     duplicates: Literal["first", "mean"] | None = key("Which of several samples at one time counts.", default=None)
     sigma: dict[str, Number] = key("Noise by output, SI; estimated where left out.", default={})
+    quantisation: dict[str, Number] = key(
+        "Step that readings are rounded to, by output, SI: an error that is uniform and follows the motion.", default={}
+    )
     initial_state: Literal["estimate", "rest"] | dict[str, Number] = key(
         '"estimate", "rest", or states with values.', default="estimate"
     )

@@ -326,6 +326,7 @@ class Problem:
             name=table.name,
             outputs=_virtual_outputs(plant, table.virtual) if table.virtual else tuple(table.outputs),
             sigma=sigma,
+            quantisation=table.quantisation,
             initial_state=table.initial_state,
             offset=table.offset,
             gain={name: _make_unknown(name, "-", gain) for name, gain in table.gain.items()},

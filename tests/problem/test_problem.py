@@ -215,6 +215,29 @@ slice_s = [1.0, 15.0]
     assert fit.outputs["chirp"]["F1"].sigma == 2.0
 
 
+def test_the_step_of_a_reading_is_the_experiment_s(write, tmp_path, short_log):
+    rows = zip(short_log.time, short_log["I"], (0.5 * (short_log["F1"] / 0.5).round()), strict=True)
+    lines = ["time [s],I [A],F1 [N]", *(f"{t:.6f},{i:.9g},{f:.9g}" for t, i, f in rows)]
+    (tmp_path / "chirp.csv").write_text("\n".join(lines), encoding="utf-8")
+    text = """
+schema = 1
+[plant.stand]
+kind = "high_impedance"
+[[experiment]]
+name = "chirp"
+plant = "stand"
+log = "chirp.csv"
+time = "time [s]"
+inputs = { I = "I [A]" }
+outputs = { F1 = "F1 [N]" }
+quantisation = { F1 = 0.5 }
+"""
+    (experiment,) = so.read_problem(write(text)).experiments()
+    assert experiment.quantisation == {"F1": 0.5}
+    with pytest.raises(so.SeaoptError, match=r"they are 0\.5"):
+        so.read_problem(write(text.replace("0.5 }", "0.3 }"))).experiments()
+
+
 def test_json_schema_is_one():
     schema = json_schema()
     assert schema["type"] == "object"

@@ -20,9 +20,11 @@ from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError
 from seaopt.estimation.solver.step_size import STEP_ERROR_PARAMETER, STEP_ERROR_SIGMA
+from seaopt.logs.quality.faults import find_quantisation
 from seaopt.parameters import QUANTILE, Parameter
 from seaopt.plants.friction import list_smoothing
 from seaopt.simulation.simulate import input_samples
+from seaopt.units import unit_after
 
 ROUGH = 0.2  # half of the width of an interval over its value, beyond which a value is known only roughly
 DEPENDS = 0.7  # correlation from which half of a value's variance is that of another one
@@ -31,6 +33,7 @@ BLOCKS, EVENT = 64, 0.1  # of a log: in so many blocks an input moves or rests; 
 MOVES = 0.01  # of the block in which an input moves the most
 LOUD = 6.0  # standard deviations of a reading's noise in a block, above which it moves
 FOLLOWED = 30.0  # standard deviations by which the outputs follow what is small: a tenth off is three of them off
+MORE = 2.0  # times the variance by white noise of its size, that rounding makes of a value: worth a word
 READING = 0.05  # of a constant, up to which what is white about it is a reading's noise
 
 
@@ -101,6 +104,33 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
             text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "
             "output, fix it, or give it a prior",
         )
+
+
+def find_rounding(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
+    """Yield outputs of which rounding decides the noise, and moves a value more than white noise would, with the line
+    that states their step.
+    """
+    free = [i for i, name in enumerate(error.names) if name in fit.covariance.names]
+    for experiment in fit.require_minimum("find_rounding").problem.experiments:
+        for output in experiment.outputs:
+            variances = error.rounding.get(output.label, np.ones(len(error.names)))[free]
+            if not free or np.max(variances) <= MORE:
+                continue
+            most = free[int(np.argmax(variances))]
+            times = math.sqrt(error.rounding[output.label][most])
+            step = find_quantisation(np.concatenate(output.measured))
+            line = f"quantisation = {{ {output.name} = {step:.6g} }}"
+            yield FitFinding(
+                severity="note",
+                kind="quantisation",
+                where=output.label,
+                text=f"its readings are rounded to steps of {step:.4g}{unit_after(output.unit)}, whose error follows "
+                f"the motion: it moves {error.names[most]} by {times:.2g} times what white noise of its size would. "
+                f"The intervals allow for it, and for noise of any other colour; {line} in its [[experiment]] takes "
+                "the error as uniform",
+                proposal=f"[[experiment]]\n{line}",
+                python=f'so.Experiment(..., quantisation={{"{output.name}": {step:.6g}}})',
+            )
 
 
 def _measure_waves(fit: Fit) -> dict[str, float]:

@@ -22,7 +22,13 @@ from seaopt.estimation.judgement.another_start import find_other_minimum
 from seaopt.estimation.judgement.causes import Cause, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.hypothesis_search import Search, search_hypotheses
-from seaopt.estimation.judgement.intervals import find_excesses, find_rough, find_single_event, find_step_error
+from seaopt.estimation.judgement.intervals import (
+    find_excesses,
+    find_rough,
+    find_rounding,
+    find_single_event,
+    find_step_error,
+)
 from seaopt.estimation.judgement.score_test import Freed, ScoreTest, free_fixed, run_score_tests
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
 from seaopt.estimation.judgement.silence import find_silent
@@ -113,6 +119,7 @@ def judge(
         *_find_noiseless(fit, minimum),
         *find_excesses(fit),
         *find_rough(fit, error),
+        *find_rounding(fit, error),
         *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each))), minimum),
         *another,
     ]

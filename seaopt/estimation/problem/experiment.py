@@ -34,6 +34,7 @@ SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
 BRIDGED = 4  # missing samples in a row, that a line stands in for
 FEWEST_READ = 16  # samples that tell a reading's noise
+WHOLE = 0.02  # of a step, by which steps may be off that a log shows
 ROUGH = 0.3  # rad of a wave, that takes 4 % of it
 Mask = Literal["auto", "declared", "none"]
 # The values of a setting, and how to name them.
@@ -62,6 +63,9 @@ class Experiment:
         Measured outputs; every output of the plant that the log has, if empty.
     sigma : mapping of output to float
         Standard deviation of the sensor noise, in the output's unit; estimated where left out.
+    quantisation : mapping of output to float
+        The step that a sensor's readings are rounded to, in the output's unit: the error is then uniform over a step,
+        besides white noise, and follows the motion. Where left out, steps that the log shows may make it so.
     initial_state : "estimate", "rest" or mapping
         Unknown in each segment; zero; or known (zero where left out).
     offset : bool or mapping
@@ -114,6 +118,7 @@ class Experiment:
     name: str = "experiment"
     outputs: tuple[str, ...] = ()
     sigma: Mapping[str, float] = field(default_factory=dict[str, float])
+    quantisation: Mapping[str, float] = field(default_factory=dict[str, float])
     initial_state: InitialState = "estimate"
     offset: bool | Mapping[str, float] = True
     drift: int = 0
@@ -334,6 +339,7 @@ class Experiment:
         require_type(self.offset, (bool, Mapping), f"experiment {self.name}: offset", "give a mapping", EstimationError)
         offset = {} if isinstance(self.offset, bool) else self.offset
         settings = {"sigma": self.sigma, "gain": self.gain, "offset": offset, "saturation": self.saturation}
+        settings["quantisation"] = self.quantisation
         for what, values in settings.items():
             if not isinstance(values, Mapping):
                 raise self._refuse(f"{what} = {values!r}; give a mapping of output to value")
@@ -346,6 +352,16 @@ class Experiment:
         for name, value in self.sigma.items():
             if not 0.0 < value < np.inf:
                 raise self._refuse(f"sigma of {name} = {value:g} is not positive; leave it out to estimate it")
+        for name, step in self.quantisation.items():
+            shown = find_quantisation(self.log[name])
+            if not (
+                0.0 < step < np.inf and round(shown / step) >= 1 and abs(shown / step - round(shown / step)) < WHOLE
+            ):
+                raise self._refuse(
+                    f"quantisation of {name} = {step:g}, but its readings are not whole steps of that apart"
+                    + (f", they are {shown:.6g}" if shown else "")
+                    + "; correct it, or leave it out of a log that was filtered or resampled"
+                )
         for name, ends in self.saturation.items():
             if not isinstance(ends, tuple | list) or len(ends) != 2 or not ends[0] < ends[1]:
                 raise self._refuse(f"saturation of {name} = {ends} is not a range; give [low, high]")

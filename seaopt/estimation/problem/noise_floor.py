@@ -6,9 +6,10 @@ difference has six times its variance, so that an output's noise is at least
 .. math:: s = \sqrt{\overline{(r_{t-1} - 2 r_t + r_{t+1})^2} / 6}
 
 (differences as of von Neumann, Ann. Math. Statist. 12, 1941), and at least what its quantisation makes, a step over
-the root of 12, which a slow signal shows in no difference. Of an output that was interpolated from a slower clock the
-differences are over so many samples as lie between two readings. The noise that a user states counts where the sensor's
-is coloured, as behind a filter. The excess, the residual's rms over that noise, is 1 to 1.1 of right models.
+the root of 12, which a slow signal shows in no difference, with the noise before it (`rounding`). Of an output that was
+interpolated from a slower clock the differences are over so many samples as lie between two readings. The noise that a
+user states counts where the sensor's is coloured, as behind a filter. The excess, the residual's rms over that noise,
+is 1 to 1.1 of right models.
 
 A plant that follows a reading (`Experiment.follow`) is shaken by that sensor's noise, which its outputs then have as
 well. How much is seen by shaking it once more by as much: the difference that this makes is added to the noise.
@@ -33,6 +34,7 @@ from seaopt.estimation.problem.residual_statistics import (
     compute_experiment_residuals,
     compute_residuals,
 )
+from seaopt.estimation.problem.rounding import find_noise
 from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.records import record
@@ -117,8 +119,12 @@ def measure_floor(experiment: FitExperiment, residuals: ExperimentResiduals) -> 
         raw = [part[mask] for mask, part in zip(used, residuals.raw_of(name), strict=True)]
         seconds = [_take_second(loss.slope(part * (gain / sigma)), apart) for part in raw]
         neighbours = float(np.sqrt(np.mean(np.concatenate(seconds) ** 2) / 6.0)) if any(map(len, seconds)) else 0.0
-        quantum = find_quantisation(np.concatenate(output.measured)) / sigma
+        stated_step = experiment.data.quantisation.get(name)
+        quantum = (stated_step or find_quantisation(np.concatenate(output.measured))) / sigma
         step[o] = 0.0 if settle or experiment.predictor is not None else quantum
+        if step[o] and apart == 1 and loss.quadratic and any(part.size > 2 for part in raw):
+            before = find_noise(quantum, [part / sigma for part in raw], neighbours)
+            neighbours = max(neighbours, float(np.hypot(before, quantum / np.sqrt(12.0))))
         stated = _weigh_gaussian(loss) if name in experiment.data.sigma else 0.0
         rounding = ROUNDING * output.spread * gain / sigma
         noise[o] = max(neighbours, quantum * gain / np.sqrt(12.0), min(stated, STATED * neighbours), rounding)

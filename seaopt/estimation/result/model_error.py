@@ -10,8 +10,8 @@ of all unknowns and E the columns of those that are wanted
 
 - b, the noise: the largest of the std for white residuals, of that for coloured ones (`covariance`), of what the
   scores :math:`\tilde J_t^T r_t` vary by within 0.1 s (Newey and West, Econometrica 55, 1987), and of what the steps of
-  coarse sensors make (`rounding`); at least 0.02 % where the residual is more than noise, and as little as a clock of
-  quartz is off by where it is not.
+  coarse sensors make (`rounding`), which is all there is of outputs whose step is stated; at least 0.02 % where the
+  residual is more than noise, and as little as a clock of quartz is off by where it is not.
 - j, parts of the log: without one of 8 contiguous parts the estimates move by :math:`d_k = -(S - H_k)^{-1} g_k`
   (a jackknife of one step: Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982);
   :math:`v = \tfrac78 \sum (d_k - \bar d)^2` and :math:`j^2 = \max(0, v - b^2)`. Where few parts have all the
@@ -40,9 +40,9 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.noise_floor import NoiseFloor, list_excess
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
+from seaopt.estimation.problem.rounding import Rounding
 from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal, Vector
 from seaopt.estimation.result.covariance import compute_bread, compute_influence, map_to_influence, take_root
-from seaopt.estimation.result.rounding import Rounding
 from seaopt.records import record
 
 PARTS = 8
@@ -71,6 +71,8 @@ class ModelError:
     parts: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
     halves: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
     few_values: ParameterMatrix = field(default_factory=lambda: np.zeros((0, 0)))
+    # of each output whose rounding is found in the log, and of each of `names`: variances over those of white noise
+    rounding: Mapping[str, ParameterVector] = field(default_factory=dict[str, ParameterVector])
     # what one unit of each moves an output by, the other unknowns following: rms over the output's spread
     effect: ParameterVector = field(default_factory=lambda: np.zeros(0))
 
@@ -107,18 +109,26 @@ def estimate_model_error(
     scores = inverse @ sums.windows @ inverse
     variance = np.where(np.isfinite(np.diag(noise)), np.diag(noise), 0.0)
     white = np.diag(inverse @ sums.power @ inverse)
-    rounded = inverse @ sums.rounded @ inverse
-    noisy = np.maximum.reduce([variance, white, np.diag(scores), np.diag(rounded)])
-    inflation = noisy / np.maximum(np.diag(inverse), 1e-300)
+    rounded, known = inverse @ sums.rounded @ inverse, inverse @ sums.stated @ inverse
+    others = np.clip(1.0 - np.diag(inverse @ sums.stated_power @ inverse) / np.maximum(white, 1e-300), 0.0, 1.0)
+    found = [variance, white, np.diag(scores)]
+    noisy = np.maximum.reduce([*(others * each for each in found), np.diag(rounded)]) + np.diag(known)
+    most = np.maximum.reduce([*found, noisy])  # what chance may make of parts and halves
+    inflation = most / np.maximum(np.diag(inverse), 1e-300)
     noise_alone = max(excess.values()) <= LITTLE
-    b2 = np.maximum(noisy, ((CLOCK if noise_alone else LEAST_SHARE) * z[stated]) ** 2)
+    least = ((CLOCK if noise_alone else LEAST_SHARE) * z[stated]) ** 2
+    b2 = np.maximum(most, least)
     return ModelError(
         names=names,
         excess=excess,
-        colour=_resize(scores + rounded, b2 - variance),
+        colour=_resize(scores + rounded + known, np.maximum(noisy, least) - variance),
         parts=_jackknife(information, sums, b2, inflation, noise_alone=noise_alone),
         halves=_compare_halves(information, sums, inflation),
         few_values=inverse @ sums.error_power @ inverse * (sums.count / INDEPENDENT),
+        rounding={
+            label: np.diag(inverse @ made @ inverse) / np.maximum(np.diag(inverse @ if_white @ inverse), 1e-300)
+            for label, (made, if_white) in sums.found.items()
+        },
         effect=sums.effect,
     )
 
@@ -136,10 +146,12 @@ def _resize(matrix: ParameterMatrix, variances: ParameterVector) -> ParameterMat
 @record(eq=False)
 class _Sums:
     """Sums over the samples, over the parameters and delays alone: H_k and g_k of parts, and of a half of each split.
-    `share` is how many of the samples are in that half, `windows` the scores' products within a window, `power`,
-    `rounded` and `error_power` the information of the outputs weighted with the power of their residuals, with that of
-    the errors that rounding makes of the coarse ones, and with that of the model's error, `effect` the largest rms over
-    the outputs' spreads that a unit of each makes.
+    `share` is how many of the samples are in that half, `windows` the scores' products within a window, `power` and
+    `error_power` the information of the outputs weighted with the power of their residuals, and with that of the
+    model's error, `stated` and `stated_power` with the errors of those whose rounding is stated, and with the power of
+    their residuals, `found` with the errors of each output whose rounding the log shows, and with white ones of the
+    same power, `coarse` both kinds of rounding, `effect` the largest rms over the outputs' spreads that a unit of each
+    makes.
     """
 
     information: Float[np.ndarray, "parts q q"]
@@ -149,10 +161,18 @@ class _Sums:
     share: Float[np.ndarray, " halves"]
     windows: ParameterMatrix
     power: ParameterMatrix
-    rounded: ParameterMatrix
+    stated: ParameterMatrix
+    stated_power: ParameterMatrix
     error_power: ParameterMatrix
+    found: Mapping[str, tuple[ParameterMatrix, ParameterMatrix]]
+    coarse: Sequence[Rounding]
     effect: ParameterVector
     count: float
+
+    @property
+    def rounded(self) -> ParameterMatrix:
+        """The information of all outputs whose rounding the log shows, weighted with its errors."""
+        return sum((made for made, _ in self.found.values()), np.zeros_like(self.power))
 
 
 def _jackknife(
@@ -189,7 +209,9 @@ def _compare_halves(information: ParameterMatrix, sums: _Sums, inflation: Parame
         inverses = [_invert_part(half + 0.5 * priors, root) for half in halves]
         scores = (sums.half_score[s] - 0.5 * whole_score, 0.5 * whole_score - sums.half_score[s])
         shift = 0.5 * (inverses[0] @ scores[0] - inverses[1] @ scores[1])
-        std = 0.5 * np.sqrt(np.maximum(np.diag(inverses[0] + inverses[1]), 0.0) * inflation)
+        white = np.maximum(np.diag(inverses[0] + inverses[1]), 0.0) * inflation
+        rounded = sum((each.compare(s, inverses) for each in sums.coarse), np.zeros(q))
+        std = 0.5 * np.sqrt(np.maximum(white, rounded))
         apart[s] = np.where(np.abs(shift) > APART * std, shift, 0.0)
     largest = np.abs(apart) == np.max(np.abs(apart), axis=0)
     chosen = np.where(largest, apart, 0.0)
@@ -214,8 +236,9 @@ def _sum_parts(
     q, loss = inverse.shape[1], problem.loss
     information, score = np.zeros((PARTS, q, q)), np.zeros((PARTS, q))
     half_information, half_score, in_half = np.zeros((HALVES, q, q)), np.zeros((HALVES, q)), np.zeros(HALVES)
-    windows, power, rounded, error_power = (np.zeros((q, q)) for _ in range(4))
-    effect = np.zeros(q)
+    windows, power, stated, stated_power, error_power = (np.zeros((q, q)) for _ in range(5))
+    found, effect = dict[str, tuple[ParameterMatrix, ParameterMatrix]](), np.zeros(q)
+    every = list[Rounding]()
     masks = {
         e.name: [np.any(s.mark_counted(e.weights.settle), axis=1) for s in e.segments] for e in problem.experiments
     }
@@ -228,7 +251,7 @@ def _sum_parts(
         length = max(1, min(round(WINDOW_S / experiment.period), experiment.samples // WINDOWS))
         split = _split(experiment, residuals[experiment.name], masks[experiment.name])
         grams = np.zeros((len(rms2), q, q))
-        coarse = [Rounding.of(step, noise, q) for step, noise in zip(floor.step, floor.noise, strict=True)]
+        coarse = [Rounding.of(step, noise, q, HALVES) for step, noise in zip(floor.step, floor.noise, strict=True)]
         for segment, high, counted in zip(experiment.segments, split, masks[experiment.name], strict=True):
             order = before + np.cumsum(counted) - counted
             into = map_to_influence(experiment, segment, inverse)
@@ -250,13 +273,19 @@ def _sum_parts(
                 grams += np.matmul(along, along.transpose(0, 2, 1))
                 for o, rounding in enumerate(coarse):
                     if rounding is not None:
-                        rounding.add(along[o], r[o])
+                        rounding.add(along[o], r[o], high[:, rows])
                 tail = _add_windows(windows, tail, scores)
             _add_windows(windows, tail, np.zeros((q, length - 1)))
             before += int(np.count_nonzero(counted))
         power += np.tensordot(rms2, grams, 1)
-        for rounding, gram in zip(coarse, grams, strict=True):
-            rounded += rounding.multiply(gram) if rounding is not None else 0.0
+        for output, rounding, gram in zip(experiment.outputs, coarse, grams, strict=True):
+            o, if_white = output.index, floor.noise[output.index] ** 2 * gram
+            made = if_white if rounding is None else rounding.multiply(gram)
+            if floor.step[o] and output.name in experiment.data.quantisation:
+                stated, stated_power = stated + made, stated_power + rms2[o] * gram
+            elif rounding is not None:
+                found[output.label] = made, if_white
+        every += [rounding for rounding in coarse if rounding is not None]
         error_power += np.tensordot(rms2 * error, grams, 1)
         size = experiment.sigma / np.maximum(experiment.spread * np.sqrt(np.maximum(floor.count, 1.0)), 1e-300)
         effect = np.maximum(effect, np.max(np.sqrt(np.diagonal(grams, 0, 1, 2)) * size[:, None], axis=0, initial=0.0))
@@ -268,8 +297,11 @@ def _sum_parts(
         share=in_half / max(samples, 1),
         windows=windows,
         power=power,
-        rounded=rounded,
+        stated=stated,
+        stated_power=stated_power,
         error_power=error_power,
+        found=found,
+        coarse=every,
         effect=effect,
         count=float(sum(np.sum(floor.count) for floor in floors.values())),
     )

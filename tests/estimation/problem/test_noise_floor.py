@@ -147,3 +147,20 @@ def test_a_followed_reading_shakes_the_outputs_with_its_noise():
     for far in (1e308, np.nan):
         broken = _add_shaking(experiment, residuals, replace(found, noise=np.array([far, 1.0])), z)
         assert broken.noise[1] == 1.0
+
+
+@pytest.mark.parametrize("steps", [7.3, 30.0])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.1, 0.2, 0.4])
+def test_a_coarse_step_hides_no_noise_of_a_slow_signal(steps, share):
+    """Both add up, though neighbours of a slow signal show little of either; a slow error beside them is excess."""
+    step = 4.0 / steps
+    total = step * np.hypot(share, 1.0 / np.sqrt(12.0))
+
+    def measure(lacking):
+        """Return noise and rms over eight places of the steps."""
+        places = step * np.arange(8) / 8.0
+        readings = (step * np.round((2.0 * SLOW + lacking + noise(share * step) + at) / step) - at for at in places)
+        return np.sqrt(np.mean([np.square(floor(reading - 2.0 * SLOW)[:2]) for reading in readings], axis=0))
+
+    assert measure(0.0) == pytest.approx([total, total], rel=0.015)
+    assert measure(step * np.sin(np.arange(N) * 7e-4))[0] == pytest.approx(total, rel=0.03)

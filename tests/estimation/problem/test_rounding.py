@@ -5,7 +5,8 @@ import pytest
 from scipy.signal import chirp, cont2discrete, dlsim
 
 import seaopt as so
-from seaopt.estimation.result.rounding import Rounding
+from seaopt.errors import EstimationError
+from seaopt.estimation.problem.rounding import Rounding
 
 RATE_HZ, N, K_TAU = 500.0, 50.0, 0.07
 TRUTH = {"J_m": 4e-5, "b_r": 1e-3, "k_s": 300.0}
@@ -36,8 +37,18 @@ def test_under_noise_of_half_a_step_nothing_is_left_of_it():
     assert Rounding.of(0.0, 0.1, 1) is None
 
 
-def fit_encoder(seed, steps, noise=0.0):
+def fit_encoder(seed, steps, noise=0.0, stated=False):
     """Return a fit of a held joint's motor angle, in so many steps over its swing, with noise of so many before it."""
+    log, step = record(seed, steps, noise)
+    plant = so.plants.rotary(link="locked")
+    known = plant.defaults.update(K_tau=K_TAU, N=N, c_s=0.0, f_c=0.0)
+    start = known.update(**{name: 1.2 * value for name, value in TRUTH.items()}).free(*TRUTH)
+    told = {"theta_m": step} if stated else {}
+    return so.fit([so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation=told)], start)
+
+
+def record(seed, steps, noise=0.0):
+    """Return the log of such a joint, and the step."""
     rng, t = np.random.default_rng(seed), np.arange(round(10.0 * RATE_HZ)) / RATE_HZ
     current = chirp(t, 0.1, 10.0, 30.0, phi=rng.uniform(0, 360)) * rng.uniform(0.8, 1.2)
     J_m, b_r, k_s = TRUTH.values()
@@ -46,11 +57,7 @@ def fit_encoder(seed, steps, noise=0.0):
     angle = dlsim((*held[:2], np.array([[1.0, 0.0]]), np.zeros((1, 1)), 1.0 / RATE_HZ), current)[1][:, 0]
     step = 2.0 * np.max(np.abs(angle)) / steps
     read = angle + rng.uniform(0, step) + noise * step * rng.normal(size=t.size)
-    log = so.Log.from_arrays(time=t, I=current, theta_m=np.round(read / step) * step)
-    plant = so.plants.rotary(link="locked")
-    known = plant.defaults.update(K_tau=K_TAU, N=N, c_s=0.0, f_c=0.0)
-    start = known.update(**{name: 1.2 * value for name, value in TRUTH.items()}).free(*TRUTH)
-    return so.fit([so.Experiment(plant=plant, log=log, outputs=("theta_m",))], start)
+    return so.Log.from_arrays(time=t, I=current, theta_m=np.round(read / step) * step), step
 
 
 def test_ten_steps_of_an_encoder_leave_intervals_that_hold():
@@ -80,3 +87,52 @@ def test_a_fine_encoder_s_intervals_stay_as_they_were():
     fit = fit_encoder(0, 400)
     for name in TRUTH:
         assert fit.parameters[name].total_std < 1.5 * fit.parameters[name].std
+
+
+def test_a_step_that_decides_is_proposed_with_its_line_and_taken_from_it():
+    fit = fit_encoder(3, 10)
+    (note,) = (finding for finding in fit.findings if finding.kind == "quantisation")
+    step = record(3, 10)[1]
+    assert note.severity == "note" and note.where == "experiment.theta_m"
+    assert note.proposal == f"[[experiment]]\nquantisation = {{ theta_m = {step:.6g} }}"
+    assert note.proposal.splitlines()[1] in note.text
+    stated = fit_encoder(3, 10, stated=True)
+    assert not any(finding.kind == "quantisation" for finding in stated.findings)
+    for name in TRUTH:
+        assert stated.parameters[name].value == pytest.approx(fit.parameters[name].value, rel=1e-9)
+        assert stated.parameters[name].total_std <= fit.parameters[name].total_std * (1.0 + 1e-9)
+
+
+def test_a_step_that_acts_as_white_noise_is_not_worth_a_word():
+    assert not any(finding.kind == "quantisation" for finding in fit_encoder(1, 2000).findings)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_intervals_of_a_stated_step_are_those_of_logs_that_begin_elsewhere_on_it(noise):
+    """The same motion on 40 places of the steps: estimates scatter as each of their fits says."""
+    log, step = record(2, 20, noise)
+    rng, plant = np.random.default_rng(5), so.plants.rotary(link="locked")
+    known = plant.defaults.update(K_tau=K_TAU, N=N, c_s=0.0, f_c=0.0, **TRUTH)
+    motion = so.simulate(plant, known, log)["theta_m"]
+    found, stds = [], []
+    for place in rng.uniform(0.0, step, 40):
+        read = np.round((motion + place + noise * step * rng.normal(size=motion.size)) / step) * step
+        moved = so.Log.from_arrays(time=log.time, I=log["I"], theta_m=read)
+        bench = so.Experiment(plant=plant, log=moved, outputs=("theta_m",), quantisation={"theta_m": step})
+        fit = so.fit([bench], known.free(*TRUTH))
+        found.append([fit.parameters[name].value for name in TRUTH])
+        stds.append([fit.parameters[name].total_std for name in TRUTH])
+    ratio = np.sqrt(np.mean(np.square(stds), axis=0)) / np.std(found, axis=0)
+    assert np.all((ratio > 0.75) & (ratio < 1.45)), ratio
+
+
+def test_a_step_that_the_readings_do_not_have_is_refused():
+    log, step = record(0, 40)
+    plant = so.plants.rotary(link="locked")
+    with pytest.raises(
+        EstimationError, match=rf"quantisation of theta_m = .* steps of that apart, they are {step:.6g}"
+    ):
+        so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation={"theta_m": 0.7 * step})
+    so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation={"theta_m": 0.5 * step})
+    with pytest.raises(EstimationError, match="quantisation names"):
+        so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation={"theta_l": step})
