@@ -21,6 +21,8 @@ def main() -> None:
             os.write(1, f"seaopt {__version__}\n".encode())
         return
     gc.set_threshold(COLLECTED)
+    # Before NumPy is loaded: threads cost these small problems more than they bring.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:  # else nobody may interrupt it, as below nohup
         signal.signal(signal.SIGINT, _leave)  # an import that is interrupted may raise anything, anywhere

@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 
 import seaopt as so
+from seaopt.__main__ import main
 from seaopt.errors import LogError
 from tests.fleet.conftest import PROBLEM, write_log
 
@@ -62,3 +63,15 @@ def test_a_log_named_in_utf8_on_a_system_of_another_encoding_has_the_remedy(stan
     assert done.returncode == 2 and b"names of files are ascii here: set PYTHONUTF8=1" in done.stderr, done.stderr
     done = subprocess.run(command, capture_output=True, check=False, cwd=stand, env=environment | {"PYTHONUTF8": "1"})
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("stated", "taken"), [(None, "1"), ("4", "4")])
+def test_commands_take_one_thread_of_blas_unless_told_otherwise(monkeypatch, stated, taken):
+    """With two on busy cores, the fit of all gains in `seaopt accept` takes ten times the processor time."""
+    monkeypatch.setattr(sys.modules["seaopt.cli.main"], "main", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["seaopt", "accept"])
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", stated or "")
+    if stated is None:
+        monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    main()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == taken
