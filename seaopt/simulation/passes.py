@@ -202,7 +202,8 @@ class Pass:
     loss: Float[np.ndarray, " ny"]  # sums of the losses
     count: Float[np.ndarray, " ny"]  # samples that counted
     outputs: Float[np.ndarray, "n ny"] | None = None  # model outputs, without gain and offset
-    columns: Float[np.ndarray, "n ny nc"] | None = None  # the v of every sample
+    columns: Float[np.ndarray, "n ny nv"] | None = None  # the v of every sample
+    chosen: Int[np.ndarray, " nc"] | None = None  # which of those columns are this pass's; all if None
     states: Float[np.ndarray, "n nx"] | None = None  # state trajectory
     changes: Float[np.ndarray, "n nx"] | None = None  # of each sample's next state, by steps of half the length
     sensitivity: Float[np.ndarray, "nx nx"] | None = None  # of the last state to the first: long logs, nonlinear plants

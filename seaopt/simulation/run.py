@@ -20,7 +20,7 @@ from seaopt.simulation.model import Model
 from seaopt.simulation.passes import DoubleSum, Influence, Lagged, Pass, Point, Segment, Weights
 
 STREAM_SAMPLES = 1 << 16  # of a stream that are in memory at a time
-KEPT_BYTES = 1 << 26  # of the passes that are kept at a time
+KEPT_BYTES = 1 << 28  # of the passes that are kept at a time
 
 Asked: TypeAlias = tuple[Model, Segment, Point, VectorX, Weights]  # of a pass: what is simulated, from which state
 
@@ -174,7 +174,8 @@ def run_passes(
     return replace(
         result,
         outputs=None if result.outputs is None or not outputs else result.outputs[:rows],
-        columns=result.columns if columns else None,
+        columns=_choose_columns(result, slice(None)) if columns else None,
+        chosen=None,
         states=result.states if states else None,
     )
 
@@ -208,8 +209,14 @@ def keep_part(asked: Asked, larger: Asked, columns: Sequence[int]) -> None:
     whole = run_passes(*larger, outputs=True, columns=True, keep=True)
     if whole.columns is not None:
         rows = np.array(columns)
-        part = replace(whole, gram=whole.gram[:, rows[:, None], rows], columns=whole.columns[:, :, rows])
-        kept.add(_key(*asked), part, model, segment)
+        kept.add(_key(*asked), replace(whole, gram=whole.gram[:, rows[:, None], rows], chosen=rows), model, segment)
+
+
+def _choose_columns(result: Pass, rows: slice) -> Any:
+    """Return the columns of some samples of a pass, of a part of another one those that are its own."""
+    if result.columns is None or result.chosen is None:
+        return None if result.columns is None else result.columns[rows]
+    return result.columns[rows].take(result.chosen, axis=2)
 
 
 def stream(
@@ -235,8 +242,8 @@ def stream(
         assert whole.outputs is not None
         for start in range(0, segment.n, chunk):
             rows = slice(start, start + chunk)
-            v = whole.columns[rows] if columns and whole.columns is not None else None
-            yield replace(whole, outputs=whole.outputs[rows], columns=v, states=None)
+            v = _choose_columns(whole, rows) if columns else None
+            yield replace(whole, outputs=whole.outputs[rows], columns=v, chosen=None, states=None)
         return
     carry, part = program.carry(), None
     for start in range(0, segment.n, chunk):
@@ -268,4 +275,8 @@ def double_sum(
         return None if program is None else program.double_sum(x0, into, r)
     _, counted = read_measured(segment, segment.n)
     counted[: weights.settle] = False
+    if kept.chosen is not None:
+        among = np.zeros((*into.shape[:2], kept.columns.shape[2]))
+        among[:, :, kept.chosen] = into
+        into = among
     return double_sum_of_columns(kept.columns, counted, into, r)

@@ -214,15 +214,9 @@ class FitExperiment:
         return run_passes(self.model, segment.samples, self.point(z), segment.start(z), self.weights, **keep)
 
     def keep_within(self, z: Vector, wider: FitExperiment, at: Float[np.ndarray, " m"]) -> None:
-        """Make the passes of the same experiment with more unknowns, and keep those at z as a part of them; of a linear
-        plant they are as quick as copies.
-        """
+        """Make the passes of the same experiment with more unknowns, and keep those at z as a part of them."""
         point, other = self.point(z), wider.point(at)
-        if self.model.linear or (point.substeps, point.stable, point.halved) != (
-            other.substeps,
-            other.stable,
-            other.halved,
-        ):
+        if (point.substeps, point.stable, point.halved) != (other.substeps, other.stable, other.halved):
             return
         free, delays = wider.model.free, [point.clock.delay_free, other.clock.delay_free]
         columns = [0, *(1 + free.index(name) for name in self.model.free), *([1 + len(free)] if delays[0] else [])]

@@ -13,9 +13,9 @@ from seaopt.simulation import keep_passes
 STAND = so.plants.high_impedance()
 
 
-def pose(**fields: object) -> FitProblem:
-    """Return a fit of a second at 400 Hz, with dry friction: passes of linear plants are not shared."""
-    truth = so.plants.thor().update(f_c=60.0, v_s=5e-3)
+def pose(f_c: float = 60.0, **fields: object) -> FitProblem:
+    """Return a fit of a second at 400 Hz, with dry friction or none: the plant is then linear."""
+    truth = so.plants.thor().update(f_c=f_c, v_s=5e-3)
     log = virtual_log(STAND, truth, PAPER_STAND, duration_s=1, rate_hz=400, seed=1,
                       sensors=Sensors(noise_std={"F1": 2.0, "F2": 2.0}))  # fmt: skip
     experiment = so.Experiment(plant=STAND, log=log, outputs=("F1", "F2"), **fields)
@@ -25,6 +25,7 @@ def pose(**fields: object) -> FitProblem:
 DELAY = so.Parameter(name="delay_s", value=1e-3, unit="s", free=True, min=0.0)
 CASES = {
     "from a free state": pose(),
+    "of a linear plant": pose(f_c=0.0),
     "a delay of its own": pose(delay_s=DELAY),
     "from rest, a gain free": pose(
         initial_state="rest", gain={"F1": so.Parameter(name="g", value=1.0, unit="", free=True)}
