@@ -90,9 +90,11 @@ def accept_logs(
     link = None
     if source.outer is not None and source.outer.plant in session.problem.plants:
         link = session.problem.plants[source.outer.plant], session.values()
+    plants = (session.problem.design_plant,) if link is None else (session.problem.design_plant, link[0])
+    beside = {name: unit for plant in plants for name, unit in plant.outputs.items()}
     with show_progress(errors, "judging the logs", errors.say) as tell:
         tell("reading the logs", 0.0)
-        read = [read_loop_log(session.problem, log, units, reference) for log in logs]
+        read = [read_loop_log(session.problem, log, units, reference, beside=beside) for log in logs]
         for text in (f"note: {log.source}: {note}" for log in read for note in log.notes):
             errors.wrap(text)
         tell("replaying the law, and comparing the machine with its model", 0.1)

@@ -27,12 +27,21 @@ OFF_RATE = 5e-3  # of the rows: as far as a clock is off
 LONG_STEP = 3.0  # periods of a step that no jitter makes of one, of ticks that are stamped late
 
 
-def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], reference: str | None = None) -> Log:
+def read_loop_log(
+    problem: Problem,
+    path: Path,
+    units: Mapping[str, str],
+    reference: str | None = None,
+    *,
+    beside: Mapping[str, str] | None = None,
+) -> Log:
     """Return a log taken under a law, with the channels that the law has and its reference.
 
     A column is that of [acceptance], else of the experiment of the controller's plant, else of the channel's own name.
     One that states no unit has the law's. `units`: of each channel, that of the reference by the name "reference".
-    `reference`: the header of its column. Raises LogError: a column is missing, or the log cannot be read.
+    `reference`: its column, by the header, with its unit or without. `beside`: channels that are read, too, with their
+    units, where the log has the column that the experiment or [acceptance] gives them. Raises LogError: a column is
+    missing, or the log cannot be read.
     """
     table = problem.table.acceptance
     fields = {field.name: field for field in contents(path).fields}
@@ -40,12 +49,14 @@ def read_loop_log(problem: Problem, path: Path, units: Mapping[str, str], refere
     columns = {} if template is None else {**template.inputs, **template.outputs}
     columns = {**columns, **table.columns} | ({} if table.reference is None else {REFERENCE: table.reference})
     columns = columns if reference is None else {**columns, REFERENCE: reference}
-    stated = {name: make_column(column, problem.folder) for name, column in columns.items() if name in units}
+    beside = {name: unit for name, unit in (beside or {}).items() if name not in units}
+    wanted = {**units, **beside}
+    stated = {name: make_column(column, problem.folder) for name, column in columns.items() if name in wanted}
     optional = stated.keys() - table.columns.keys() - {REFERENCE}  # of another log, which may have more
     stated = {name: column for name, column in stated.items() if name not in optional or _has(column, fields)}
     channels: dict[str, Column] = {}
-    for name, unit in units.items():
-        column = _choose_column(name, stated.get(name), fields)
+    for name, unit in wanted.items():
+        column = stated.get(name) if name in beside else _choose_column(name, stated.get(name), fields)
         if column is None:
             continue  # who judges the log says what it is for
         field = fields.get(column.column) if isinstance(column.column, str) else None
@@ -141,5 +152,7 @@ def _choose_column(name: str, stated: Column | None, fields: Mapping[str, Field]
     if stated is not None and _has(stated, fields):
         return stated
     called = REFERENCES if name == REFERENCE else (name,)
+    if stated is not None and name == REFERENCE:  # another one than was named is none
+        called = (stated.column,)
     header = next((field for field in fields if field in called or bare_name(field) in called), None)
     return stated if header is None else Column(column=header)

@@ -11,6 +11,7 @@ import pytest
 import seaopt as so
 from seaopt.cli.main import app
 from seaopt.files import write_json
+from seaopt.problem.loop_logs import read_loop_log
 from tests.c_code import CompiledLog
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
@@ -101,6 +102,27 @@ def test_columns_without_units_and_with_other_names_are_read(folder, accept):
     assert accept(folder / "bare.csv", "--reference", "goal").exit_code == 0
     wrong = accept(folder / "bare.csv")
     assert wrong.exit_code != 0 and "--reference COLUMN" in str(wrong.exception)
+
+
+def test_the_reference_is_found_by_its_name_with_its_unit_or_without(folder, accept):
+    text = (folder / "good.csv").read_text()
+    (folder / "x0.csv").write_text(text.replace("reference [N]", "goal [N]", 1))
+    assert accept(folder / "x0.csv", "--reference", "goal").exit_code == 0
+    wrong = accept(folder / "good.csv", "--reference", "goal")  # in place of which `reference` is not taken
+    assert wrong.exit_code != 0 and 'no column "goal"' in str(wrong.exception)
+
+
+def test_an_output_that_the_law_does_not_read_is_taken_where_its_column_is_stated(folder):
+    log = so.read_log(folder / "good.csv")
+    names = {name: log[name] for name in log.signals}
+    so.write_log(so.Log.from_arrays(time=log.time, units={"F2": "N"}, F2=2.0 * log["F1"], **names), folder / "two.csv")
+    units, outputs = {"reference": "N", "F1": "N", "I": "A"}, {"F1": "N", "F2": "N"}
+    problem = folder / "beside.toml"
+    for stated in ("", '[acceptance]\ncolumns = { F2 = "F2 [N]" }\n'):
+        problem.write_text(PROBLEM + stated)
+        read = read_loop_log(so.read_problem(problem), folder / "two.csv", units, beside=outputs)
+        assert ("F2" in read.signals) == bool(stated)
+        assert "F2" not in read_loop_log(so.read_problem(problem), folder / "two.csv", units).signals
 
 
 @pytest.mark.parametrize(
