@@ -23,6 +23,7 @@ from seaopt.estimation.result.fit_result import Fit
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, add_part
+from seaopt.plants.parts import list_dead_times
 from seaopt.plants.plant import name_symbols
 from seaopt.records import record
 from seaopt.simulation import simulate
@@ -55,7 +56,8 @@ class Hypothesis:
     """What a model may lack: in words, the part that brings it, and from which values of its own a refit starts.
 
     Those that it frees are the first of each start; `fixed` are chosen once. What is `searched` is free in the refit
-    alone, and fixed at its value where the effect is taken: logs hardly tell how large it is. `poles` are in Hz.
+    alone, and fixed at its value where the effect is taken: logs hardly tell how large it is. `poles` are in Hz, a
+    `dead_time` in s: alone it is an experiment's own delay, and named as that (`candidates`).
     `usual` is of what logs often do not show at all: a size that actuators have, with a spring of that stiffness
     (`silence`); `built_in` the parameter by which a plant has it without the part.
     """
@@ -66,6 +68,7 @@ class Hypothesis:
     fixed: Callable[[Sizes], Mapping[str, float]] = lambda sizes: {}
     searched: tuple[str, ...] = ()
     poles: tuple[str, ...] = ()
+    dead_time: str | None = None
     usual: Callable[[float], float] | None = None
     built_in: Callable[[Plant], str | None] = lambda plant: None
     lag: Callable[[Mapping[str, float]], float] = lambda start: 0.0  # s, that a fitted delay has in place of the effect
@@ -110,6 +113,12 @@ HYPOTHESES = (
         starts=lambda s: [{"current_loop_hz": hertz} for hertz in (60.0, 110.0, 200.0)],
         poles=("current_loop_hz",),
         lag=lambda start: 1.0 / (2.0 * math.pi * start["current_loop_hz"]),
+    ),
+    Hypothesis(
+        effect="the command arrives late",
+        part="command_delay",
+        starts=lambda s: [{"T_c": 1e-3}],  # from more than it is a step beside another effect ends elsewhere
+        dead_time="T_c",
     ),
     Hypothesis(effect="friction changes over the log", part="friction_drift", starts=_zero("w_c", "b_t")),
     Hypothesis(
@@ -212,7 +221,7 @@ def change_plants(
     change of another, which the experiments and parameters have.
     """
     starts, fixed = hypothesis.starts(sizes), hypothesis.fixed(sizes)
-    if not starts:
+    if not starts or (hypothesis.dead_time is not None and any(map(_has_delay, experiments))):
         return None
     names = {*starts[0], *fixed}
     changed: dict[Plant, Plant] = {}
@@ -234,8 +243,9 @@ def change_plants(
         parameter = declared[name]
         assert isinstance(parameter, Parameter)
         most = fastest if name in hypothesis.poles else parameter.max
-        value = min(max(value, parameter.min), most)
-        added.append(replace(parameter, value=value, max=most, free=name in starts[0]))
+        least = 1.0 / fastest if name == hypothesis.dead_time else parameter.min
+        value = min(max(value, least), most)
+        added.append(replace(parameter, value=value, min=least, max=most, free=name in starts[0]))
     return Change(
         hypotheses=(*(before.hypotheses if before else ()), hypothesis),
         frees=(*(before.frees if before else ()), *starts[0]),
@@ -245,6 +255,13 @@ def change_plants(
         starts=starts,
         sizes=sizes,
     )
+
+
+def _has_delay(experiment: Experiment) -> bool:
+    """Tell whether an experiment's delay is estimated, or its plant has one: a servo's is of its firmware."""
+    recipe, delay = experiment.plant.recipe, experiment.delay_s
+    servo = recipe is not None and "position_servo" in recipe.parts
+    return servo or (isinstance(delay, Parameter) and delay.free) or bool(list_dead_times(experiment.plant))
 
 
 def measure_sizes(fit: Fit) -> Sizes:

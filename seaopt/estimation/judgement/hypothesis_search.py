@@ -525,10 +525,14 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
     # Two effects are taken where one leaves an excess, and the other takes half of that; where one would do, all of it.
     most = max(REMOVED, NEARLY * first)
     most_of_pair = most if best_single > most else ASKS
+    # A delay alone is an experiment's own, which other causes name: what leaves more than it does explains nothing.
+    late = [refit for refit in single if refit.change.hypotheses[0].dead_time is not None]
+    least_late = min((refit.excess for refit in late), default=np.inf)
     able = [
         refit
         for refit in refits
-        if refit.excess <= most
+        if refit.excess <= min(most, TIED * least_late)
+        and refit not in late
         and not refit.undecided
         and (_takes_half(first, refit.excess) if first > ASKS else refit.gain > CHANCE * colour)
         and (refit in single or (refit.excess <= most_of_pair < best_single and _takes_half(best_single, refit.excess)))

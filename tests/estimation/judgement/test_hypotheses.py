@@ -113,6 +113,39 @@ def test_what_removes_the_excess_is_named_with_its_value(effects, part, value):
     assert not result.met
 
 
+def fit_late(**effects):
+    """Return the fit, without a delay, to a log whose command is stamped a sample before it arrives."""
+    log, plant = record(**effects), so.plants.rotary(link="locked")
+    late = {name: log[name][:-1] for name in ("tau_s", "theta_m")}
+    log = so.Log.from_arrays(time=log.time[:-1], I=log["I"][1:], **late)
+    params = plant.defaults.update(**TRUTH).update(J_m=3e-5, b_r=2e-4, k_s=250.0, f_c=0.015).free(*FREE)
+    return so.fit([so.Experiment(plant=plant, log=log, outputs=("tau_s", "theta_m"), name="log")], params)
+
+
+@pytest.mark.parametrize(
+    ("effects", "part", "value"),
+    [({"harder": 8.0}, "hardening", {"k_3": 2400.0}), ({"droop": 0.005}, "droop", {"a_i": 0.005})],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_command_that_is_late_beside_another_effect_is_no_lagging_current(effects, part, value):
+    """A current loop of 63 Hz took most of it: hardening with it left 11 times the noise, and was adopted."""
+    result = fit_late(**effects)
+    (best, *_) = result.hypotheses
+    assert ({*best.parts}, best.outcome) == ({part, "command_delay"}, "adopted")
+    assert best.excess < ASKS
+    for name, expected in {**value, "T_c": 1.0 / RATE_HZ}.items():
+        assert best.frees[name] == pytest.approx(expected, rel=0.01)
+    assert find_error(best.parameters) < 0.01
+
+
+def test_a_delay_alone_is_that_of_the_experiment():
+    result = fit_late()
+    assert not any(trial.outcome in ("adopted", "tied") for trial in result.hypotheses)
+    (cause,) = (finding for finding in result.findings if finding.kind == "cause")
+    assert "log.delay_s" in cause.preferred
+    assert cause.preferred["log.delay_s"][0] == pytest.approx(1.0 / RATE_HZ, rel=0.01)
+
+
 def record_screw(lag_s, noise=2.0, seed=0, v_s=2e-3, rises_s=0.0):
     """Return the log of a screw on a held spring: two load cells that a mass of a pound tells apart, F2 = F1 + m dv/dt,
     and a current that lags its command, which is held between samples and arrives a millisecond late.
