@@ -17,6 +17,7 @@ from seaopt.machine.causes import Cause, find_causes, leave_open
 from seaopt.machine.decimated import SAME_RATE, LineMatch, count_ticks_per_row, match_lines
 from seaopt.machine.hidden import find_hidden
 from seaopt.machine.open_loop import find_unfollowed
+from seaopt.machine.reference_offset import Offset, tell_offset
 from seaopt.machine.response.tripped import Trip
 from seaopt.machine.stepped import FLOOR, Match, Others, Setting, Source, make_setting, play
 from seaopt.machine.stopped import find_stop
@@ -50,6 +51,7 @@ class Replay:
     possible: tuple[Cause, ...] = ()  # of a log with every n-th tick: laws with other parts that it does not exclude
     stretches: int = 1  # between its gaps
     trip: Trip | None = None  # of the law's gate: what comes after it is no longer of the law
+    offset: Offset | None = None  # of the reference that the law was given, within half of the step it is logged in
     unit_missing: bool = False  # of the reference, which may be the law's own or that of its outer loop
 
     @property
@@ -83,7 +85,7 @@ def replay(source: Source, ticks: Ticks, others: Others | None = None) -> Replay
         if lines is not None and (limited or first is None or not first.explains):
             return _describe_lines(whole, lines, ticks_per_row)
         if first is not None and first.kind == "late" and first.what == "command" and first.explains:
-            late, causes, match = int(first.value or 0), (), play(changed)
+            late, causes, whole, match = int(first.value or 0), (), changed, play(changed)
         elif (stop := find_stop(whole, match)) is not None:
             causes = (stop,)
         elif (names := _find_open(whole, match, first)) is not None:
@@ -115,6 +117,7 @@ def replay(source: Source, ticks: Ticks, others: Others | None = None) -> Replay
         rate_hz=rate_hz,
         law_rate_hz=law_rate_hz,
         causes=causes,
+        offset=tell_offset(whole, match) if met else None,
     )
 
 

@@ -196,6 +196,7 @@ class Match:
     error: Float[np.ndarray, " n"]
     integrals: int  # of the law, in which rounding adds up
     allowed_within: float  # rms, within stretches, beside what the integrals hold at the start of each
+    offset: float = 0.0  # by which a rounded reference lies above what the law was given
 
     @property
     def energy(self) -> float:
@@ -259,9 +260,11 @@ def play(setting: Setting) -> Match:
     commands = np.concatenate([ticks.command[:first], run_setting(setting, ticks.take(slice(first, None)), start)])
     if linear.compensation is not None:  # which differences to a row before the first
         commands[0] = ticks.command[0]
-    commands = commands - find_offset(linear, ticks, float(steps[0]), commands - ticks.command)
+    offset, steady = find_offset(linear, ticks, float(steps[0]), commands - ticks.command)
+    commands = commands - offset * steady
     return Match(
         commands=commands,
+        offset=offset,
         allowed=allowed,
         error=commands - ticks.command,
         integrals=count_integrals(linear),
@@ -399,15 +402,26 @@ def _estimate_moving(setting: Setting, ticks: Ticks, allowed: Float[np.ndarray, 
     return replace(begin, x=np.linalg.lstsq(modes, (first.command - still) * weight, rcond=1e-10)[0])
 
 
-def find_offset(law: RunnableLaw, ticks: Ticks, step: float, error: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return what a law's integrals make of the mean of a reference's rounding, as an error has it: where the reference
-    repeats it is the same in each period. It is no more than half of the `step` that it is rounded to.
+def find_offset(
+    law: RunnableLaw, ticks: Ticks, step: float, error: Float[np.ndarray, " n"]
+) -> tuple[float, Float[np.ndarray, " n"]]:
+    """Return by how much a reference lies above what a law was given, as an error has it, and what an offset of one
+    makes of the commands: where the reference repeats the mean of its rounding is the same in each period, and runs up
+    in integrals. It is no more than half of the `step` that it is rounded to.
     """
-    if not step or not count_integrals(law) or np.any(find_at_limit(ticks, law)):
-        return np.zeros(len(ticks))
-    impulse = np.concatenate([[law.d_reference], list_powers(law.c, law.a, len(ticks) - 1) @ law.b_reference])
-    steady = law.per_effort * np.cumsum(impulse)
-    return float(np.clip(steady @ error / (steady @ steady), -0.5 * step, 0.5 * step)) * steady
+    limited = find_at_limit(ticks, law)
+    if not step or not count_integrals(law) or np.all(limited):
+        return 0.0, np.zeros(len(ticks))
+    ones = replace(ticks, reference=np.ones(len(ticks)), measured=0.0 * ticks.measured)
+    steady = np.where(limited, 0.0, follow(replace(law, compensation=None), ones, limited, 0.0))
+    return float(np.clip(steady @ error / (steady @ steady), -0.5 * step, 0.5 * step)), steady
+
+
+def list_impulses(law: RunnableLaw, count: int) -> Float[np.ndarray, "k n"]:
+    """Return what the reference, and each reading, makes of the commands from one row of it on."""
+    columns = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
+    direct = np.append(law.d_reference, -np.ravel(law.d_measurement))
+    return law.per_effort * np.vstack([direct, list_powers(law.c, law.a, count - 1) @ columns]).T
 
 
 def list_steps(ticks: Ticks) -> Float[np.ndarray, " k"]:

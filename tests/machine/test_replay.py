@@ -56,6 +56,27 @@ def test_a_log_that_begins_in_the_middle_and_is_rounded_is_the_same_law(controll
     assert so.accept(controller, [log]).replayed
 
 
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize("cut", [np.floor, np.ceil, np.round, lambda values: np.round(values - 0.2)])
+def test_an_offset_of_a_reference_in_coarse_steps_is_said_where_rounding_does_not_make_it(
+    controller, bench, cut, late, tmp_path
+):
+    step, log = 0.5, bench.log(Machine(), REFERENCE)
+    logged = step * cut(log["reference"] / step)
+    truth, made = float(np.mean(log["reference"] - logged)), cut is not np.round
+    columns = {"reference": logged, "F1": log["F1"], "I": np.roll(log["I"], late)}
+    result = so.accept(controller, [so.Log.from_arrays(time=log.time, **columns).between(0.05, 9.5)])
+    (row,) = result.replays
+    assert row.met and row.command_late == late and made == (row.offset is not None), row
+    text = " ".join(repr(result).split())
+    assert made == ("within half of its step of 0.5 N" in text)
+    if row.offset is not None:
+        assert abs(row.offset.value - truth) < 3.0 * row.offset.std < 0.1 * step, (row.offset, truth)
+        assert row.offset.step == pytest.approx(step) and not row.offset.or_reading
+        assert f"{abs(row.offset.value):.3g} N {'above' if truth > 0.0 else 'below'}" in text
+        assert result.to_dict()["replay"]["logs"][0]["offset"]["value"] == row.offset.value
+
+
 @pytest.mark.parametrize("late", [1, -1])
 def test_a_command_that_is_logged_a_row_late_or_early_is_allowed(controller, bench, late):
     log = bench.log(Machine(), REFERENCE)

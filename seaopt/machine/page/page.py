@@ -14,6 +14,7 @@ from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.gains.free_gains import read_gains
 from seaopt.machine.page.figures import list_panels
 from seaopt.machine.page.verdict import OUTCOMES, judge, name_figure, say_inside, say_undecided, show_interval
+from seaopt.machine.reference_offset import Offset
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import SHORT_BY, Judged, Measured, Response, compares_amplitudes
@@ -332,6 +333,11 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         if row.met and row.possible
     )
     remarks += tuple(
+        _say_offset(Path(source).name, row.offset, unit_after(result.controller.command.reference_unit))
+        for source, row in zip(result.sources, result.replays, strict=True)
+        if row.offset is not None
+    )
+    remarks += tuple(
         HIDDEN.format(Path(source).name, format_number(row.causes[0].sigmas, 2))
         for source, row in zip(result.sources, result.replays, strict=True)
         if row.causes and row.causes[0].sigmas is not None
@@ -362,6 +368,16 @@ def _describe_replay(result: Acceptance) -> list[Section]:
                 Section(title=f"Causes that were tried on {Path(source).name}", part="causes", tables=(table,))
             )
     return sections
+
+
+def _say_offset(name: str, offset: Offset, unit: str) -> str:
+    """Return that the reference which a law was given is not the logged one."""
+    value, way = f"{format_number(abs(offset.value), 3)}{unit}", ("below", "above")[int(offset.value > 0.0)]
+    reading = ", or the reading as much the other way" if offset.or_reading else ""
+    return (
+        f"In {name} the law was given a reference {value} {way} the logged one{reading}, within half of its step of "
+        f"{format_number(offset.step, 3)}{unit}: cut off digits make it, rounded ones do not. Log it with more digits."
+    )
 
 
 def _say_reach(result: Acceptance) -> str:
