@@ -37,6 +37,8 @@ _TOKEN = re.compile(r"[A-Za-zµμΩ°%]+")
 
 
 COMMON_SI = ("", "m", "s", "kg", "N", "A", "rad", "N m", "m/s", "rad/s", "m/s^2", "V", "rad/s^2", "K", "Hz", "W")
+# In place of base units: stiffness, damping, torque per current, speed per voltage, winding.
+DERIVED_SI = ("N/m", "N m/rad", "N s/m", "N m s/rad", "N/A", "N m/A", "V s/rad", "ohm", "H")
 # What nearly all logs are in, in SI: asking pint takes half a second the first time.
 _USUAL = {
     **{unit: (unit, 1.0) for unit in COMMON_SI}, **dict.fromkeys(DIMENSIONLESS, ("", 1.0)), "Nm": ("N m", 1.0),
@@ -111,7 +113,7 @@ def si_unit(unit: str) -> str:
         return _USUAL[unit.strip()][0]
     parsed = _parse(unit)
     angular = "radian" in str(_registry().Quantity(1, parsed).to_root_units().units)
-    for candidate in COMMON_SI:
+    for candidate in (*COMMON_SI, *DERIVED_SI):
         if parsed.dimensionality == _parse(candidate).dimensionality and angular == ("rad" in candidate):
             return candidate
     return f"{_registry().Quantity(1.0, parsed).to_base_units().units:~C}".replace("**", "^").replace("*", " ")

@@ -51,6 +51,25 @@ def test_dimensions_are_compared():
     assert si_unit("m^3") == "m^3"
 
 
+@pytest.mark.parametrize(
+    ("unit", "si"),
+    [
+        ("N m/rad", "N m/rad"),
+        ("N m/deg", "N m/rad"),
+        ("kN/mm", "N/m"),
+        ("N s/mm", "N s/m"),
+        ("N m s/rad", "N m s/rad"),
+        ("mN m/A", "N m/A"),
+        ("N/A", "N/A"),
+        ("V s/rad", "V s/rad"),
+        ("mohm", "ohm"),
+        ("mH", "H"),
+    ],
+)
+def test_units_of_an_actuator_are_those_that_engineers_write(unit, si):
+    assert si_unit(unit) == si and factor(si_unit(unit), si) == 1.0
+
+
 def test_texts_of_units():
     assert [f"{0.3:g}{units.unit_after(unit)}" for unit in ("m", "-")] == ["0.3 m", "0.3"]
     assert units.divide_units("A", "N m") == "A/(N m)"
