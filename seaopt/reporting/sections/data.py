@@ -6,8 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Literal
 
-from seaopt.formatting import MISSING
+from seaopt.formatting import MISSING, format_number
 from seaopt.records import record
+
+LEAST_GRACE = 0.005  # that is said
 
 Style = Literal["good", "bad", "error", "warning", "note"]
 
@@ -26,6 +28,11 @@ Cell = str | Mark
 def mark_met(met: bool, yes: str = "met", no: str = "not met") -> Mark:
     """Return a verdict as a cell."""
     return Mark(text=yes, style="good") if met else Mark(text=no, style="bad")
+
+
+def show_limit(sense: str, limit: float | None, grace: float) -> str:
+    """Return a limit as a cell, with the share by which it may be missed where that shows in its figure."""
+    return f"{sense} {format_number(limit)}" + (f" ({100.0 * grace:g} % grace)" if grace > LEAST_GRACE else "")
 
 
 @record

@@ -485,8 +485,9 @@ def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[st
     alone = list(draw)  # of a single one it is the run that failed
     if len(draw) > 1:
         alone = [key for key in draw if fails(place_values(plant, nominal, {key: draw[key]}))]
-    wrong = ", ".join(alone or draw)
-    together = "" if alone else " together"
+    wrong, together = ", ".join(alone or draw), "" if alone else " together"
+    if failed.fault is not None and failed.fault.kind == RINGS:  # the loop, of a plant that may be known well
+        return f"a lower bandwidth_hz, or narrower ranges of {wrong} in [robustness]: the loop rings there"
     return f"fit {wrong} or narrow their ranges in [robustness]: the model is too wrong in them{together}{room}"
 
 

@@ -154,6 +154,13 @@ def test_the_report_has_its_limits(mpc, stand, thor, tmp_path):
         assert "Predictive control" in page and words in page and f"{one.achieved.ms:.4g}" in page
 
 
+def test_the_table_of_limits_has_the_units_of_the_plant_and_the_grace_of_the_bandwidth():
+    plant = so.plants.rotary(link="locked")
+    text = " ".join(str(made(plant, plant.defaults, measured="tau_s", bandwidth_hz=12.0, max_noise_gain=50.0)).split())
+    assert "noise gain" in text and "N m/(N m)" in text and "N/N" not in text
+    assert text.count("% grace") == 1 and "= 12 (2 % grace) Hz met" in text
+
+
 def test_its_loops_are_judged_once(stand, rubbing, monkeypatch):
     """Made, printed and asked for its limits: one measurement for sliding, one for stuck; a copy has its own."""
     counted = []

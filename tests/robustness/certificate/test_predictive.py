@@ -117,6 +117,14 @@ def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, 
     assert "fit delay_s or narrow" in late.constrained.remedy
 
 
+def test_of_a_loop_that_rings_a_lower_bandwidth_is_asked_for(stand, thor, monkeypatch):
+    """With nothing asked of where the force settles, as of a link that moves."""
+    monkeypatch.setattr(constrained._Case, "_judge_force", lambda *_: None)
+    mpc = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=20.0))
+    late = so.certify(mpc, {"stand": stand}, thor, ranges={"delay_s": (6.5e-3, 6.6e-3)}, samples=1, runs=1).constrained
+    assert late.ringing == 1 and late.remedy.startswith("a lower bandwidth_hz, or narrower ranges of delay_s")
+
+
 def test_a_bound_that_noise_breaks_on_the_design_plant_itself_is_named_with_the_room_it_needs(stand, thor):
     spec = MPCSpec(current_limit_A=9.0, current_slew_A_per_s=2000.0, bandwidth_hz=20.0, bounds={"qd": (-0.05, 0.05)})
     tight = force_mpc(stand, thor, spec)

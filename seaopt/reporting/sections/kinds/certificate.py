@@ -21,6 +21,7 @@ from seaopt.reporting.sections.data import (
     Verdict,
     list_notes,
     mark_met,
+    show_limit,
 )
 from seaopt.reporting.sections.kinds.controller import explain_sliding, show_costs
 from seaopt.reporting.sections.kinds.simulated import list_left_out, summarise_findings
@@ -341,7 +342,7 @@ def _list_requirements(certificate: Certificate) -> Section:
             mark_met(row.met),
             label_requirement(row),
             format_number(row.value),
-            f"{row.sense} {format_number(row.limit)}",
+            show_limit(row.sense, row.limit, row.tolerance),
             unit_after(row.unit).strip(),
             (f"{row.where} (the worst of {count} such failures)" if count > 1 else row.where)
             + ("" if row.risk is None else f"; {row.scope}, risk {row.risk:.2g}"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from seaopt.control import ForceMPC
 from seaopt.control.laws.verdict import join_labels
 from seaopt.formatting import format_count, format_number
-from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met
+from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met, show_limit
 
 
 def judge(mpc: ForceMPC, commands: Commands) -> Verdict:
@@ -27,13 +27,14 @@ def describe(mpc: ForceMPC) -> list[Section]:
         f"{name} within {low:g} and {high:g} {mpc.kalman.units[mpc.kalman.names.index(name)]}".rstrip()
         for name, (low, high) in spec.bounds.items()
     ]
+    loops = {loop.name: loop for loop in mpc.measured_loops}
     rows = tuple(
         (
             verdict.plant,
             verdict.limit.label,
             format_number(verdict.value),
-            f"{verdict.limit.symbol} {format_number(verdict.allowed)}",
-            verdict.limit.unit,
+            show_limit(verdict.limit.symbol, verdict.allowed, verdict.limit.tolerance),
+            loops[verdict.plant].unit(verdict.limit),
             mark_met(verdict.met),
         )
         for verdict in mpc.verdicts
