@@ -394,6 +394,7 @@ def certify_problem(
     executor: Executor | None = None,
     simulations: bool = True,
     large_signals: bool = True,
+    thorough: bool = True,
 ) -> Certificate:
     """Certify a controller or schedule on the problem's plants, simulations included, as `seaopt certify` does.
 
@@ -405,7 +406,7 @@ def certify_problem(
         The law, which knows its design plant.
     source : Fit or ParameterSet
         The fit; or values, of a problem without experiments.
-    progress, executor, simulations, large_signals
+    progress, executor, simulations, large_signals, thorough
         As in `seaopt.certify`; without all simulations sensors and rounding are not simulated.
     """
     table, plants, measured = problem.robustness, problem.certified_plants(), problem.measure_responses(source)
@@ -432,6 +433,7 @@ def certify_problem(
         bounds=Budget() if table.bounds else None,
         simulations=simulations,
         large_signals=large_signals,
+        thorough=thorough,
         sensors=problem.sensors.of(read) if simulations else None,  # the file may name those of its other laws
         command_step=table.step if simulations else 0.0,
         measured=measured,

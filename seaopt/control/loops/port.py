@@ -14,10 +14,12 @@ from seaopt.control.loops.sampled_plant import (
     sample_linear,
 )
 from seaopt.control.loops.transfer_function import Frequencies, Response
+from seaopt.control.systems.resolvent import Resolvent
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant, state_space
 from seaopt.plants.friction import leave_out_waves
+from seaopt.plants.memo import memo
 from seaopt.plants.motor.thermal import freeze_heat
 from seaopt.plants.plant import share_drive
 from seaopt.records import record
@@ -68,23 +70,23 @@ class PortModel:
         """Return the responses to motor force and to motion, F_e being what that motion takes. They are infinite at an
         undamped pole, though Z under feedback is not: there they are those just beside it.
         """
-        n, s = self.motor.size, 2j * np.pi * self._beside(f)
-        inner = np.zeros((f.size, n + 1, n + 1), dtype=complex)
-        inner[:, :n, :n] = s[:, None, None] * np.eye(n) - self.a
-        inner[:, :n, n] = -self.force
-        inner[:, n, self.speed] = 1.0
-        causes = np.zeros((n + 1, 2))
-        causes[:n, 0], causes[n, 1] = self.motor, 1.0
-        x = np.linalg.solve(inner, causes[None])
-        taken = x[:, n]
-        read = np.einsum("yi,mij->ymj", self.read[:, :n], x[:, :n]) + self.read[:, n + 1, None, None] * taken
-        read[:, :, 0] += self.read[:, n, None]
+        s, at = 2j * np.pi * self._beside(f), self.force[self.speed]
+        # The speed is v, the position v/s, and F_e is what moves them: s v = a x + b F_m + at F_e in the speed's row.
+        taken, pushed = -self.a[self.speed] / at, -self.motor[self.speed] / at
+        a, b, c, d = self.load(taken, pushed)
+        rows, direct, of_force = np.vstack([c, taken]), np.append(d, pushed), np.append(self.read[:, -1], 1.0)[:, None]
+        causes = np.column_stack([b, a[:, self.speed], a[:, self.position], self.force / at])
+        inside = ~np.isin(np.arange(b.size), [self.speed, self.position])
+        answers = Resolvent.of(a[inside][:, inside], causes[inside], rows[:, inside]).respond(s)
+        driven = answers[:, 0] + direct[:, None]
+        moved = answers[:, 1] + rows[:, [self.speed]] + (answers[:, 2] + rows[:, [self.position]]) / s
+        moved += answers[:, 3] * s + of_force * (s / at)
         late = np.exp(-s * self.delay_s)
         return PortResponse(
-            motor_to_read=read[:, :, 0] * late,
-            motion_to_read=read[:, :, 1],
-            motor_to_port=taken[:, 0] * late,
-            motion_to_port=taken[:, 1] - s * self.mass,
+            motor_to_read=driven[:-1] * late,
+            motion_to_read=moved[:-1],
+            motor_to_port=driven[-1] * late,
+            motion_to_port=moved[-1] - s * self.mass,
         )
 
     def load(
@@ -119,6 +121,7 @@ class PortModel:
         return out
 
 
+@memo
 def probe_of(plant: Plant) -> Plant:
     """Return the plant that shows what the port is to the world: a bare inertia on it, the other links held. It is
     without heat, as all that looks at linear loops. Raises ControlError: the plant states no port, or its port states

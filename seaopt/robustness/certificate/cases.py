@@ -39,6 +39,7 @@ from seaopt.robustness.uncertainty.worst import place_values
 
 CONFIDENCE = 1.0 - 1e-6
 MOST_DELAY_SAMPLES = 20  # samples
+ENDED = "a requirement is not met, and what takes long was left out from there on"
 DESIGN_NAMES = ("design", DESIGN_PLANT)  # of the design plant where the caller does not list it
 Draw = Mapping[str, float]
 Subject = Controller | ScheduledController | ForceMPC
@@ -103,6 +104,8 @@ class Survey:
     steps: bool = True  # whether steps are simulated,
     simulations: bool = True  # and all scenarios,
     large_signals: bool = True  # with sweeps of amplitudes
+    thorough: bool = True  # else what takes long is left out once a requirement is broken,
+    broken: bool = False  # as one is already, of another value of the schedule
     sensors: Sensors | None = None
     measured: Mapping[str, MeasuredResponse] = field(default_factory=dict[str, MeasuredResponse])
     executor: Executor | None = None
@@ -124,6 +127,12 @@ class Survey:
         """The subject of a check of a schedule as a whole."""
         assert isinstance(self.subject, ScheduledController)
         return self.subject
+
+    @property
+    def ends_early(self) -> bool:
+        """Whether what takes long is left out: a requirement is broken, or will be, as a draw fails."""
+        draws = self.found.get("monte_carlo")
+        return not self.thorough and (self.broken or (draws is not None and draws.failures > 0))
 
     @property
     def samples(self) -> int:
@@ -155,6 +164,8 @@ class Check:
     measure: Callable[[Survey, Progress], Evidence]
     seconds: Callable[[Survey], float] = lambda _: 0.0
     applies: Callable[[Survey], bool] = lambda survey: bool(survey.cases.models)
+    # Whether it is asked where a requirement is broken already, and what takes long is then left out.
+    brief: Callable[[Survey], bool] = lambda _: False
 
 
 def ask(checks: Sequence[Check], survey: Survey, progress: Progress) -> Evidence:
@@ -162,12 +173,16 @@ def ask(checks: Sequence[Check], survey: Survey, progress: Progress) -> Evidence
     asked = [check for check in checks if check.applies(survey)]
     rows, remarks = list[Requirement](), list[str]()
     for check, part in zip(asked, divide(progress, *(check.seconds(survey) for check in asked)), strict=True):
+        if survey.ends_early and not check.brief(survey):
+            remarks += [] if ENDED in remarks else [ENDED]
+            continue
         evidence = check.measure(survey, part)
         for row in evidence.requirements:
             risk = evidence.risk if row.risk is None else row.risk
             rows.append(replace(row, place=row.place or survey.place, scope=evidence.scope, risk=risk))
         remarks += evidence.remarks
-        survey = replace(survey, found={**survey.found, **evidence.fields})
+        broken = survey.broken or not all(row.met for row in evidence.requirements)
+        survey = replace(survey, found={**survey.found, **evidence.fields}, broken=broken)
     return Evidence(requirements=rows, fields=survey.found, remarks=tuple(remarks))
 
 

@@ -30,6 +30,7 @@ from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.robustness.bounds.bracket import Budget
 from seaopt.robustness.certificate.cases import (
     CONFIDENCE,
+    ENDED,
     Cases,
     CertifyOptions,
     Check,
@@ -76,6 +77,7 @@ def certify(
     bounds: Budget | None = None,
     simulations: bool = True,
     large_signals: bool = True,
+    thorough: bool = True,
     sensors: Sensors | None = None,
     command_step: float = 0.0,
     measured: Mapping[str, MeasuredResponse] | None = None,
@@ -138,6 +140,9 @@ def certify(
         sizes alone, which takes a few seconds less; so does predictive control, beside its runs.
     large_signals : bool
         With the simulations, sweep amplitudes for the curve of bandwidth against them, of which nothing is required.
+    thorough : bool
+        False leaves out what takes long (friction margins that are not asked for, the impedance, simulations, the fit's
+        logs) once a requirement is not met: the certificate fails either way, and says less of it.
     sensors, command_step
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     measured : mapping of name to MeasuredResponse, optional
@@ -197,7 +202,7 @@ def certify(
     require_type(parameters, (Fit, ParameterSet), "parameters", "give a Fit or a ParameterSet", ControlError)
     require_type(others, (ParameterSet, NoneType), "others", "give a ParameterSet", ControlError)
     require_type(bounds, (Budget, NoneType), "bounds", "give a Budget", ControlError)
-    for name, value in (("simulations", simulations), ("large_signals", large_signals)):
+    for name, value in (("simulations", simulations), ("large_signals", large_signals), ("thorough", thorough)):
         require_type(value, bool, name, "give True or False", ControlError)
     require_type(sensors, (Sensors, NoneType), "sensors", "give Sensors", ControlError)
     require_type(ranges, (Mapping, NoneType), "ranges", "give a mapping of name to (low, high)", ControlError)
@@ -218,6 +223,7 @@ def certify(
         options=options,
         simulations=simulations and not isinstance(subject, ForceMPC),
         large_signals=large_signals,
+        thorough=thorough,
         sensors=sensors,
         executor=executor,
     )
@@ -296,12 +302,14 @@ def _certify_schedule(whole: Survey, progress: Progress) -> Certificate:
     surveys, schedule, of_responses = whole.places, whole.schedule, ask((MEASURED,), whole, ignore)
     seconds = [count_seconds(CHECKS, survey) for survey in surveys]
     *parts, joining = divide(progress, *seconds, count_seconds(SCHEDULE_CHECKS, whole))
-    places = tuple(
-        _certify_cases(survey, CHECKS, prefix(part, f"{schedule.over} = {survey.place[1]:.4g}"))
-        for survey, part in zip(surveys, parts, strict=True)
-        if survey.place is not None
-    )
-    joint = _certify_cases(replace(whole, found={"places": places}), SCHEDULE_CHECKS, joining)
+    places, broken = list[Certificate](), False
+    for survey, part in zip(surveys, parts, strict=True):
+        assert survey.place is not None
+        hook = prefix(part, f"{schedule.over} = {survey.place[1]:.4g}")
+        places.append(_certify_cases(replace(survey, broken=broken), CHECKS, hook))
+        broken = broken or not places[-1].met or places[-1].monte_carlo.failures > 0
+    found = {"places": (*places,)}
+    joint = _certify_cases(replace(whole, found=found, broken=broken), SCHEDULE_CHECKS, joining)
     progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
     of_places = (row for place in places for row in place.requirements)
     return replace(
@@ -309,14 +317,15 @@ def _certify_schedule(whole: Survey, progress: Progress) -> Certificate:
         controller=schedule.controllers[0],
         schedule=schedule,
         requirements=(*of_places, *of_responses.requirements, *joint.requirements),
-        remarks=of_responses.remarks,
+        remarks=(*of_responses.remarks, *joint.remarks),
     )
 
 
 def _certify_cases(survey: Survey, checks: Sequence[Check], progress: Progress) -> Certificate:
     """Ask each check that applies to the cases of one law, or of a schedule as a whole."""
     cases, evidence = survey.cases, ask(checks, survey, progress)
-    none: dict[str, Any] = {"plants": {}, "margins": {}, "steps": None if cases.models else NO_MODEL}
+    steps = NO_MODEL if not cases.models else ENDED if survey.steps and ENDED in evidence.remarks else None
+    none: dict[str, Any] = {"plants": {}, "margins": {}, "steps": steps}
     return Certificate(
         requirements=tuple(evidence.requirements),
         controller=cases.controller,

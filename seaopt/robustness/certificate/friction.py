@@ -65,7 +65,11 @@ def measure_friction(survey: Survey, progress: Progress) -> Evidence:
     return Evidence(requirements=rows, fields=fields, scope="drawn" if draws else "nominal")
 
 
-FRICTION = Check(measure=measure_friction, seconds=lambda survey: SECONDS * len(survey.cases.plants))
+FRICTION = Check(
+    measure=measure_friction,
+    seconds=lambda survey: SECONDS * len(survey.cases.plants),
+    brief=lambda survey: survey.min_friction_margin is not None,
+)
 
 
 def find_nominal_margins(

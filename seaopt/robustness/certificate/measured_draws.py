@@ -81,7 +81,12 @@ def _list_seconds(survey: Survey) -> tuple[float, float]:
     return DRAW * survey.samples * plants, (SEARCH + BOUND * bounded) * plants
 
 
-DRAWS = Check(measure=measure_uncertainty, seconds=lambda survey: sum(_list_seconds(survey)), applies=lambda _: True)
+DRAWS = Check(
+    measure=measure_uncertainty,
+    seconds=lambda survey: sum(_list_seconds(survey)),
+    applies=lambda _: True,
+    brief=lambda _: True,
+)
 
 
 def measure_draws(

@@ -112,7 +112,7 @@ def measure_sweeps(survey: Survey, progress: Progress) -> Evidence:
 STRETCHES = Check(
     measure=measure_stretches, seconds=lambda survey: BOUND * len(survey.places) * len(survey.cases.models)
 )
-JOINT_DRAWS = Check(measure=join_places)
+JOINT_DRAWS = Check(measure=join_places, brief=lambda _: True)
 SWEEPS = Check(measure=measure_sweeps, seconds=lambda survey: SWEEP * survey.simulations * len(survey.cases.models))
 
 
@@ -215,6 +215,8 @@ def state_assumption(schedule: ScheduledController, sweeps: Mapping[str, Sequenc
 def state_proof(schedule: ScheduledController, stretches: Sequence[StretchBound]) -> str:
     """Return the statement that is proved between the points, or where none is."""
     over, first, last = schedule.over, schedule.points[0], schedule.points[-1]
+    if not stretches:
+        return "what is between the values that were looked at was left out"
     missing = [stretch for stretch in stretches if not stretch.shown]
     if not missing:
         largest = np.ceil(1e3 * max(stretch.ms for stretch in stretches)) / 1e3

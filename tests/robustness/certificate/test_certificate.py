@@ -31,6 +31,8 @@ SPEC = so.ControllerSpec(
     bandwidth_hz=30, max_sensitivity=1.6, max_complementary=1.3, max_reference_peak=1.3, max_noise_gain=25
 )
 
+NOISE = so.Sensors(noise_std={"F1": 2.0})
+
 
 @pytest.fixture(scope="module")
 def controller(stand, swing, thor):
@@ -64,6 +66,24 @@ def test_it_passes_with_the_stated_bound(certificate):
     assert certificate.monte_carlo.failures == 0
     assert certificate.monte_carlo.failure_probability_bound < 0.01001
     assert "passed" in repr(certificate)
+
+
+def test_what_takes_long_is_left_out_where_a_requirement_is_broken_and_only_there(controller, stand, swing, thor):
+    strict, options = replace(controller, spec=replace(SPEC, max_sensitivity=1.1)), {"samples": 20, "sensors": NOISE}
+    for law, holds in ((controller, True), (strict, False)):
+        whole, brief = (so.certify(law, {"swing": swing}, thor, **options, thorough=each) for each in (True, False))
+        assert whole.met is brief.met is holds
+        if holds:
+            assert brief.requirements == whole.requirements and brief.remarks == whole.remarks
+            continue
+        kept = {"nominal", "drawn"}
+        assert brief.requirements == tuple(row for row in whole.requirements if row.scope in kept)
+        assert (
+            whole.simulated is not None
+            and brief.simulated is None
+            and len(brief.requirements) < len(whole.requirements)
+        )
+        assert "what takes long was left out" in " ".join(repr(brief).split())
 
 
 def test_every_requirement_says_of_which_plants_and_at_which_risk(certificate):

@@ -25,6 +25,7 @@ from seaopt.robustness.certificate.scheduled import require_motion, require_rate
 from seaopt.robustness.verification import limit_cycles, schedule_sweep, verification
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
+from seaopt.robustness.verification.verification import Verification
 from seaopt.simulation import Clock
 from tests.schedules import POINTS, read_knee, tune_knee
 from tools.golden import compare
@@ -89,6 +90,18 @@ def test_draws_beyond_what_the_law_bears_fail_it():
         simulations=False,
     )  # fmt: skip
     assert not wide.passed and wide.monte_carlo.failures > 0
+
+
+def test_once_it_is_broken_somewhere_the_other_places_are_not_simulated():
+    stand, swing, values = read_knee()
+    schedule = tune_knee()
+    strict = replace(schedule.spec, max_sensitivity=1.1)
+    strict = replace(schedule, controllers=tuple(replace(each, spec=strict) for each in schedule.controllers))
+    failed = so.certify(strict, {"stand": stand, "swing": swing}, values, ranges=RANGES, samples=9, thorough=False)
+    assert "what takes long was left out" in " ".join(repr(failed).split())
+    assert not failed.met and not failed.sweeps and not failed.stretches
+    assert len(failed.places) == 9 and failed.monte_carlo.samples == 9
+    assert all(place.simulated is None and not isinstance(place.steps, Verification) for place in failed.places)
 
 
 @pytest.mark.slow

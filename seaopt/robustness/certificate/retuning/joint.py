@@ -60,7 +60,7 @@ class Round:
         Number of plants on which the tuner kept its limits, the design plant included.
     controller : Controller or ScheduledController
     certificate : Certificate or None
-        None if the controller misses its limits on those plants already.
+        None if the controller misses its limits on those plants already; of one that fails what takes long is left out.
     added : tuple of str
         Witnesses that the next round keeps its limits on too.
     """
@@ -86,7 +86,7 @@ class JointTuning(Result):
     controller : Controller or ScheduledController
         Of the last round.
     certificate : Certificate or None
-        Of that controller; None if it is infeasible.
+        Of that controller, as in its round; None if it is infeasible.
     rounds : tuple of Round
     robust_to : mapping of name to (plant, parameters) or MeasuredResponse
         Every plant besides the design plant on which the last controller had to keep its limits.
@@ -256,6 +256,7 @@ def tune_certified(
                 seed=seed + number - 1,
                 confidence=share,
                 simulations=False,
+                thorough=False,
                 executor=executor,
                 progress=certifying,
             )
