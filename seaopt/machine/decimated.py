@@ -337,7 +337,7 @@ def evaluate(law: Law, blocks: Blocks, ticks_per_row: int, image: int = 0) -> Co
 def find_leakage(law: Law, blocks: Blocks, ticks_per_row: int) -> Float[np.ndarray, "k n"]:
     """Return an orthonormal basis, at the lines, of what a law's state at the start of a period adds to its rows."""
     rows, lines = blocks.rows, np.round(blocks.f * blocks.period_s).astype(int)
-    a, _, row = law.rest
+    a, _, row = law.remainder
     stepped, columns = np.linalg.matrix_power(a, ticks_per_row), np.empty((rows, row.size))
     for k in range(rows):
         columns[k] = row

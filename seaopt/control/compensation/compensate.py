@@ -124,7 +124,7 @@ def _find_margin(
     term: FrictionTerm, plant: Plant, params: ParameterSet, loop: FrictionLoop | None, first: str, enough: float
 ) -> CompensationMargin:
     def refuse(why: str) -> CompensationMargin:
-        return CompensationMargin(slope=0.0, asked=term.slope, frequency_hz=0.0, multiplier=why)
+        return CompensationMargin(slope=0.0, required=term.slope, frequency_hz=0.0, multiplier=why)
 
     if loop is None:
         return refuse("the plant has no friction to compensate")

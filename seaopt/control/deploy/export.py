@@ -389,7 +389,7 @@ def _numbers(stored: Controller, law: RunnableLaw, number: Writer) -> dict[str, 
 
     per_reference, per_measurement = law.rest()
     transfer_functions = multiply_out(stored.law, stored.link)
-    b, d, rest = (
+    b, d, resting = (
         np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)
     )
     readings = list(map(identifier, stored.signals[1:]))
@@ -408,9 +408,9 @@ def _numbers(stored: Controller, law: RunnableLaw, number: Writer) -> dict[str, 
         "d_measurement": number(float(d[0, 0])),
         "anti_windup": row(law.anti_windup),
         "rest_reference": row(per_reference),
-        "rest_measurement": row(rest[0]),
+        "rest_measurement": row(resting[0]),
         "columns_of": {
-            name: {"b": row(b[i]), "d": number(float(d[i, 0])), "rest": row(rest[i])}
+            name: {"b": row(b[i]), "d": number(float(d[i, 0])), "rest": row(resting[i])}
             for i, name in enumerate(readings, start=1)
         },
         "tracking_time_s": None if law.tracking_time_s is None else number(law.tracking_time_s),

@@ -76,7 +76,7 @@ def describe_schedule(law: RunnableSchedule, first: Controller, number: Writer) 
     }
 
 
-def _trace(law: RunnableSchedule, asked: str, columns: list[str], signals: list[str], number: Writer) -> dict[str, Any]:
+def _trace(law: RunnableSchedule, force: str, columns: list[str], signals: list[str], number: Writer) -> dict[str, Any]:
     """Return step and reset as lines of C, and what they are given and keep."""
     order = law.table.order
     states = list(law.table.states)
@@ -87,7 +87,7 @@ def _trace(law: RunnableSchedule, asked: str, columns: list[str], signals: list[
         x = {name: Term(trace, f"law->x[{i}]") for i, name in enumerate(states)}
         return trace, gains, x, Term(trace, reference), [Term(trace, text) for text in (reading, *signals)]
 
-    trace, gains, x, reference, readings = begin(asked, "reading")
+    trace, gains, x, reference, readings = begin(force, "reading")
     reference, added = _compensate(law, gains, reference, _REMEMBERED)
     effort, applied, after = order.step(
         gains, x, reference, readings, lambda effort: trace.keep(f"limited({effort.text}, most)", [effort.text]), added

@@ -128,10 +128,10 @@ def sweep(
         found = sweep_schedule(schedules, specs, executor, progress)
         progress(f"{spec.structure} over {over}, {len(found)} bandwidths", 1.0)
         return Frontier(rows=tuple(row for row, _ in found), controllers=tuple(law for _, law in found), over=over)
-    sliding, others = slide_plants(plant, params, robust_to)
+    sliding, sliding_robust_to = slide_plants(plant, params, robust_to)
     swept = _Sweep(
         task=make_task(plant, params, specs[0], robust_to, draws),
-        sliding=make_task(sliding, params, specs[0], others, draws),
+        sliding=make_task(sliding, params, specs[0], sliding_robust_to, draws),
         design=(plant, params),
         outer=outer,
         free_law=free_law,

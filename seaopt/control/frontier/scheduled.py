@@ -61,16 +61,16 @@ class ScheduleSweep:
     @property
     def sticks(self) -> bool:
         """Whether there is friction that a plant sticks with."""
-        others = [other if isinstance(other, tuple) else (other, self.params) for other in self.robust_to.values()]
-        models = [(plant, values) for plant, values in others if isinstance(plant, Plant)]
+        pairs = [other if isinstance(other, tuple) else (other, self.params) for other in self.robust_to.values()]
+        models = [(plant, values) for plant, values in pairs if isinstance(plant, Plant)]
         every = [(self.plant, self.params), *models]
         return any(take_sliding(plant, plant.complete(values)) is not plant for plant, values in every)
 
     def slide(self) -> ScheduleSweep:
         """Return the same with plants that slide alone."""
-        design, others = slide_plants(self.plant, self.params, self.robust_to)
+        design, robust_to = slide_plants(self.plant, self.params, self.robust_to)
         assert isinstance(design, Plant)
-        return replace(self, plant=design, robust_to=others)
+        return replace(self, plant=design, robust_to=robust_to)
 
     def measure(self, schedule: ScheduledController, *, free_law: bool = False) -> list[FrontierRow]:
         """Return a row for each place of a schedule; with the best of all linear laws at its points."""

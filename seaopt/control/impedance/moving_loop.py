@@ -72,8 +72,8 @@ def close_link(link: ControlledLink, velocity_filter_s: float, load: Load | None
     pushed = -share * (load.inertia - port.mass) * port.motor[port.speed]
     a, b, c, d = port.load(taken, pushed)
     rows, direct = np.vstack([c, np.eye(1, port.motor.size, k=port.position)]), np.append(d, 0.0)
-    held = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
-    a, b, c, d = (part[0] for part in held)
+    sampled = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
+    a, b, c, d = (part[0] for part in sampled)
     plant, outer = make_plant(a, b, c, d, link.delay_samples), link.speed_filter(velocity_filter_s)
     plant = replace(plant, outputs=(*plant.outputs[:-1], POSITION))
     return MovingLoop(block=connect([plant, link.law.block, outer.block], [REFERENCE], [POSITION, SPEED]), outer=outer)

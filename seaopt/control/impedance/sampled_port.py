@@ -121,8 +121,8 @@ class SampledPort:
     def angles(self) -> Angles:
         """Return angles from nearly static to the Nyquist frequency, close about the modes of plant and loop."""
         period = self.link.sample_time_s
-        held = self.held_poles()
-        poles = np.concatenate([self.link.port.find_poles(), np.log(held[np.abs(held) > 1e-6]) / period])
+        locked = self.held_poles()
+        poles = np.concatenate([self.link.port.find_poles(), np.log(locked[np.abs(locked) > 1e-6]) / period])
         at, width = np.abs(np.imag(poles)), np.abs(np.real(poles))
         around = at[:, None] + width[:, None] * np.concatenate([-NEAR_MODES, [0.0], NEAR_MODES])
         folded = np.abs((around.ravel() * period + np.pi) % (2 * np.pi) - np.pi)

@@ -326,9 +326,9 @@ class PlausibilityGate:
                 raise ControlError(
                     f"{name} = {value:g} is not between {1.0 / LARGEST:g} and {LARGEST:g}; give such a number"
                 )
-        held: Any = self.max_held
-        if isinstance(held, bool) or not isinstance(held, int | np.integer) or not 0 <= held <= MOST_HELD:
-            raise ControlError(f"max_held = {held!r} is not a number of samples; give 0, 1, ... up to {MOST_HELD}")
+        limit: Any = self.max_held
+        if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or not 0 <= limit <= MOST_HELD:
+            raise ControlError(f"max_held = {limit!r} is not a number of samples; give 0, 1, ... up to {MOST_HELD}")
 
     def start(self, measurement: float) -> GateState:
         """Return the state in which the first reading must be near a measurement at rest. Raises ControlError: it is
@@ -356,8 +356,8 @@ class PlausibilityGate:
         agrees = self.agreement is None or self.agreement.holds(measurement, encoders)
         if near and agrees:
             return measurement, GateState(measurement=measurement)
-        held = state.held + 1
-        return state.measurement, replace(state, held=held, fault=held > self.max_held, disagrees=near)
+        refused = state.held + 1
+        return state.measurement, replace(state, held=refused, fault=refused > self.max_held, disagrees=near)
 
     def ramp(self, current_A: float, sample_time_s: float) -> float:
         """Return the command a sample later, at a fault."""
@@ -366,7 +366,7 @@ class PlausibilityGate:
 
     @classmethod
     def of_controller(
-        cls, controller: Any, *, noise: Mapping[str, float] | None = None, **asked: Any
+        cls, controller: Any, *, noise: Mapping[str, float] | None = None, **options: Any
     ) -> PlausibilityGate:
         """Return a gate with the step that the design plant makes at most, times a margin for what the world does.
 
@@ -376,7 +376,7 @@ class PlausibilityGate:
             With its design plant and a current limit.
         noise : mapping of str to float, optional
             Std of what is measured and of the encoders, for an agreement.
-        **asked
+        **options
             Fields of `GateSpec`: range_N, and where they differ from its defaults max_step_N, max_held, ramp_s, margin,
             agreement, zero.
 
@@ -397,7 +397,7 @@ class PlausibilityGate:
         """
         if not hasattr(controller, "command_limit"):
             raise ControlError(f"controller = {controller!r:.80}: give a Controller, or a ForceMPC")
-        spec, limit = GateSpec(**asked), controller.command_limit
+        spec, limit = GateSpec(**options), controller.command_limit
         if limit is None:
             raise ControlError("the controller has no current limit (or command_limit); give its specification one")
         largest = spec.max_step_N

@@ -151,8 +151,8 @@ class Guarded:
         added = 0.0
         if self.outer is not None:
             (position,) = self._take(readings, self.outer.position) if readings else (0.0,)
-            place, force = self.outer.split(reference)
-            reference = force + follow_link(self.outer.numbers, FIRST, place, position)[-1]
+            x_0, force = self.outer.split(reference)
+            reference = force + follow_link(self.outer.numbers, FIRST, x_0, position)[-1]
         if self.compensation is not None:
             reads = self._take_terms(readings) or (0.0,) * len(self.compensation.reads)
             reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads, numbers)
@@ -207,9 +207,9 @@ class Guarded:
         """
         if self.outer is not None:
             (position,), outer = self._take(readings, self.outer.position), state.outer
-            place, force = self.outer.split(reference)
-            if is_number(place) and is_number(position):
-                outer = follow_link(self.outer.numbers, outer, place, position)
+            x_0, force = self.outer.split(reference)
+            if is_number(x_0) and is_number(position):
+                outer = follow_link(self.outer.numbers, outer, x_0, position)
             noted["outer"], reference = outer, force + outer[-1]
         if self.heat is None:
             return self._decide(state, reference, measurement, readings, self.command_limit, advance, numbers, noted)
@@ -544,6 +544,6 @@ def _compute_tracking_time(law: Law) -> float:
     m = law.integrators
     column = 0 if law.b[m - 1, 0] else 1
     # The coefficient of w^(m-1), w = 1/(z - 1): the next one of the chain, or what is left at 0 Hz.
-    following = law.b[m - 2, column] if m > 1 else law.static_rest[column]
+    following = law.b[m - 2, column] if m > 1 else law.static_remainder[column]
     ratio = abs(float(following) / float(law.b[m - 1, column]) - m)
     return law.sample_time_s * min(max(ratio, 1.0), 1e300)  # next to no integral it would be infinite

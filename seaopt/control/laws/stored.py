@@ -267,8 +267,8 @@ def _check_gains(
         "link_feedforward": (spec.link_feedforward, to_content(link) or {}),
     }
     for name, (requested, has) in parts.items():
-        asked = {} if requested is None else asdict(requested)
-        numbers = {key: value for key, value in asked.items() if value is not None}
+        fields = {} if requested is None else asdict(requested)
+        numbers = {key: value for key, value in fields.items() if value is not None}
         check_agrees(numbers, has, FILE, remedy=TUNE_AGAIN, path=f"spec.{name}", rtol=AGREES)
     if (observer is not None) != (spec.structure == "pid_dob") or (observer and gains["T_q"] != observer.T_q):
         raise _contradict("blocks.observer", "is not that of structure and gains")

@@ -269,9 +269,16 @@ class DisturbanceObserver:
         return self._enclose(law, law.plus(Assembly.of_gains(np.ones(1))), None, np.zeros(1), sample_time_s)
 
     def _enclose(
-        self, law: Assembly, known: Assembly, seen: Assembly | None, surplus: Columns, sample_time_s: float
+        self,
+        law: Assembly,
+        through_q: Assembly,
+        through_inverse: Assembly | None,
+        surplus: Columns,
+        sample_time_s: float,
     ) -> Assembly:
-        """Return law + (Q known + Q_0 seen)/(1 - Q); `surplus`: at 0 Hz of the inputs that nothing integrates but Q."""
+        """Return law + (Q through_q + Q_0 through_inverse)/(1 - Q); `surplus`: at 0 Hz of the inputs that nothing
+        integrates but Q.
+        """
         pole, short = self._pole(sample_time_s)
         kept = self.nominal.kept
         e = np.zeros(max(kept.size - 1, 2))
@@ -279,8 +286,8 @@ class DisturbanceObserver:
         at_one = float(np.sum(e)) + 2 * pole * short
         e[:2] += [2 * pole * short + pole**2, -(pole**2)]
         over_e = TransferFunction(num=short**2 / e[:1], den=e / e[0])
-        estimate = known.through(TransferFunction(num=kept, den=np.ones(1)))
-        estimate = (estimate if seen is None else estimate.plus(seen)).through(over_e)
+        estimate = through_q.through(TransferFunction(num=kept, den=np.ones(1)))
+        estimate = (estimate if through_inverse is None else estimate.plus(through_inverse)).through(over_e)
         return law.plus(estimate.integrated(np.array([estimate.static[0], *(short**2 / at_one * surplus[1:])])))
 
     def _pole(self, sample_time_s: float) -> tuple[float, float]:

@@ -7,15 +7,15 @@ y may be several signals, the first the regulated one: :math:`C_y y = \sum_i C_i
 
 The first m states are a chain of accumulators, :math:`x_j^+ = x_j + x_{j+1} + \dots`, read at its head:
 
-.. math:: u = \sum_{j=1}^{m} g_j w^j + \text{(a stable rest)}, \qquad w = \frac{1}{z-1},
+.. math:: u = \sum_{j=1}^{m} g_j w^j + \text{(a stable remainder)}, \qquad w = \frac{1}{z-1},
 
 with :math:`g_j` the j-th row of B. Its poles are 1 to the last bit, however many they are, and the loop comes to rest
 where :math:`g_m` says: at a force equal to its reference exactly if the two columns' :math:`g_m` are equal but for
 their sign. Multiplied out as polynomials a double pole at 1 is known to the root of rounding only, and the DC gain of
 what stands beside it to :math:`\epsilon/\prod|1 - p_i|`, which at a few kHz is percents.
 
-Responses use :math:`z - 1` itself and a complex Schur form of the rest, by back substitution for all frequencies at
-once, so that they keep their digits down to 0 Hz.
+Responses use :math:`z - 1` itself and a complex Schur form of the remainder, by back substitution for all frequencies
+at once, so that they keep their digits down to 0 Hz.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from seaopt.control.loops.minimal import (
     build_chain,
     has_response,
     read_companion,
-    realise_rest,
+    realise_remainder,
     refuse_slow_poles,
     split,
     split_integrators,
@@ -103,21 +103,21 @@ class Law:
         return Block(a=self.a, b=self.b, c=rows * self.c, d=rows * self.d, inputs=inputs, outputs=(EFFORT, COMMAND))
 
     @property
-    def rest(self) -> tuple[Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]:
+    def remainder(self) -> tuple[Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]:
         """A, B and C of what does not integrate."""
         m = self.integrators
         return self.a[m:, m:], self.b[m:], self.c[m:]
 
     @property
-    def static_rest(self) -> VectorK:
+    def static_remainder(self) -> VectorK:
         """The part that does not integrate, at 0 Hz: effort per reference and per measured signal."""
-        a, b, c = self.rest
+        a, b, c = self.remainder
         return self.d + c @ np.linalg.solve(np.eye(c.size) - a, b)
 
     @property
     def poles(self) -> ComplexN:
         """The eigenvalues of `a`, those of the chain exactly 1."""
-        return np.concatenate([np.ones(self.integrators), np.linalg.eigvals(self.rest[0])]).astype(complex)
+        return np.concatenate([np.ones(self.integrators), np.linalg.eigvals(self.remainder[0])]).astype(complex)
 
     def responses(self, f: Frequencies) -> Complex[np.ndarray, "k m"]:
         """Return u per reference and per measured signal at frequencies in Hz; very large at 0 where it integrates."""
@@ -153,7 +153,7 @@ class Law:
         Balanced, controllability and observability Gramians are equal and diagonal, which keeps rounding noise low, so
         that single precision can hold the states (`seaopt.control.loops.minimal`).
         """
-        m, block = self.integrators, self.rest
+        m, block = self.integrators, self.remainder
         if not block[2].size or np.max(np.abs(np.linalg.eigvals(block[0]))) >= 1.0:
             return self
         try:
@@ -164,7 +164,7 @@ class Law:
 
     def transfer_functions(self) -> tuple[TransferFunction, ...]:
         """Return C_r and each C_y multiplied out over one denominator, for reading: they say less than the law does."""
-        m, (a, b, c) = self.integrators, self.rest
+        m, (a, b, c) = self.integrators, self.remainder
         powers = [polypow([1.0, -1.0], k) for k in range(m + 1)]  # of 1 - q
         slow = np.real(np.poly(a)) if c.size else np.ones(1)
         out: list[TransferFunction] = []
@@ -337,7 +337,7 @@ class Law:
             chain[: gains.size, column] = gains
         sign = np.array([1.0] + [-1.0] * len(measurements))
         through = sign * np.array([tf.num[0] for tf in paths_by_name.values()], dtype=float)
-        a, b, c = realise_rest([part[1:] for part in parts])
+        a, b, c = realise_remainder([part[1:] for part in parts])
         made = cls(**build_chain(chain * sign, a, b * sign, c), d=through, sample_time_s=sample_time_s)
 
         def find_wrong(law: Law) -> str | None:
@@ -418,8 +418,8 @@ def _count_integrators(law: Law) -> int:
 
 @lru_cache(maxsize=32)
 def _factorise(law: Law) -> tuple[int, Resolvent]:
-    """Return how many states integrate, and of the rest the resolvent from its output to its inputs, once for a law."""
-    a, b, c = law.rest
+    """Return how many states integrate, and the resolvent of the remainder from output to inputs, once for a law."""
+    a, b, c = law.remainder
     return law.integrators, Resolvent.of(a.T, c[:, None], b.T)
 
 
@@ -453,7 +453,7 @@ def find_integral_rate(law: Law) -> float:
     m = law.integrators
     if not m:
         return np.inf
-    last, before = -law.b[m - 1, 1], 1.0 - law.static_rest[1] if m == 1 else -law.b[m - 2, 1]
+    last, before = -law.b[m - 1, 1], 1.0 - law.static_remainder[1] if m == 1 else -law.b[m - 2, 1]
     return float(last / (law.sample_time_s * (before - 0.5 * m * last)))
 
 

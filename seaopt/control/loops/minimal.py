@@ -92,7 +92,9 @@ def _count_roots_at_one(name: str, den: Vector) -> int:
     return count
 
 
-def realise_rest(parts: list[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]) -> tuple[Matrix, Inputs, Vector]:
+def realise_remainder(
+    parts: list[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]],
+) -> tuple[Matrix, Inputs, Vector]:
     """Return Y/R of all parts (Y, R) in observer form, each of its input: on shared states where R is the same, else
     side by side. The direct terms, Y at q = 0, are left out. The form is of polynomials in z - 1, in which slow poles
     have digits that they do not have in z, with its states scaled.

@@ -71,14 +71,14 @@ def keep_share(position: str) -> float:
 
 
 def enclose_law(
-    law: Law, outer: OuterLoop, place: int | None = None, *, kept: float = 1.0, of_force: bool = False
+    law: Law, outer: OuterLoop, signal: int | None = None, *, kept: float = 1.0, of_force: bool = False
 ) -> Law:
-    """Return the law of x_0, of what a force law measures and of the link's position, that both loops make. `place`:
+    """Return the law of x_0, of what a force law measures and of the link's position, that both loops make. `signal`:
     which of the measured signals is the link's position; it is one more, the last, where none of them is. `kept` is of
     `keep_share`. `of_force`: of the force law's reference in place of x_0.
     """
-    (n, columns), column = law.b.shape, -1 if place is None else 1 + place
-    b, d = np.zeros((n + 1, columns + (place is None))), np.zeros(columns + (place is None))
+    (n, columns), column = law.b.shape, -1 if signal is None else 1 + signal
+    b, d = np.zeros((n + 1, columns + (signal is None))), np.zeros(columns + (signal is None))
     b[:n, 1:columns], d[1:columns] = law.b[:, 1:], law.d[1:]
     stiffness, damping, pole, rate = outer.numbers
     drive, through = np.append(law.b[:, 0], 0.0), law.d[0]

@@ -138,8 +138,8 @@ class OuterLoop:
         reference, position : float
             x_0 and x, m or rad.
         """
-        after, _, asked = follow_link(self.numbers, (state, 1.0, 0.0), reference, position)
-        return asked, after
+        after, _, force = follow_link(self.numbers, (state, 1.0, 0.0), reference, position)
+        return force, after
 
     @property
     def per_given(self) -> float:

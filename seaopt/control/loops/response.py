@@ -212,7 +212,7 @@ def close(plant: Block, law: Law) -> ClosedLoop:
         d=d,
         resolvent=resolvent,
         opened=opened,
-        blocks=(plant.a, law.rest[0]),
+        blocks=(plant.a, law.remainder[0]),
         table=table,
         through=through,
     )

@@ -413,7 +413,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
     def unlimited(self) -> Law:
         """Return the plan as long as no limit is active: from its reference and the measurement to current."""
         gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.command_limit
-        rest, kalman, start = self.rest, self.kalman, self.kalman.start
+        x_rest, kalman, start = self.rest, self.kalman, self.kalman.start
         n, delay = len(kalman.A), kalman.delay_samples
         acting = max(delay + bool(np.any(kalman.late)), 1)  # commands that still act, of which the last is one
 
@@ -424,7 +424,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
             state = replace(start, predicted=z, past=past)
             corrected, innovation, ahead = self._observe(state, y)
             u_s = r / self.static_gain - ahead[-1]
-            current = u_s + gains @ np.append(ahead[: rest.size] - rest * r / self.static_gain, past[-1, 0] - u_s)
+            current = u_s + gains @ np.append(ahead[: x_rest.size] - x_rest * r / self.static_gain, past[-1, 0] - u_s)
             after = self._command(state, corrected, innovation, current)
             return np.concatenate([after.predicted, after.past[delay + 1 - acting :, 0], [current]])
 

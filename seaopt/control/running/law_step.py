@@ -167,9 +167,9 @@ def _chain_steps(shape: LawShape, _thread: int) -> DirectCall:
     """Return the steps of a chunk in a row, which a thread has to itself: what is kept after each, and the commands."""
     kept, numbers = ca.SX.sym("kept", shape.kept), ca.SX.sym("numbers", sum(shape.number_sizes))
     r, y = ca.SX.sym("r"), ca.SX.sym("y", shape.measured)
-    more, place = ca.SX.sym("w", len(shape.further)), ca.SX.sym("place", int(shape.schedule is not None))
-    command, after = express_step(shape, numbers, kept, r, ca.vertsplit(y), ca.vertsplit(more), place)
-    step = ca.Function("step", [kept, numbers, r, y, more, place], [ca.densify(after), ca.densify(command)])
+    more, variable = ca.SX.sym("w", len(shape.further)), ca.SX.sym("place", int(shape.schedule is not None))
+    command, after = express_step(shape, numbers, kept, r, ca.vertsplit(y), ca.vertsplit(more), variable)
+    step = ca.Function("step", [kept, numbers, r, y, more, variable], [ca.densify(after), ca.densify(command)])
     return DirectCall(step.mapaccum(CHUNK))
 
 
@@ -184,10 +184,10 @@ def express_step(
     reference: Any,
     measured: Sequence[Any],
     further: Sequence[Any],
-    place: Any = None,
+    variable: Any = None,
 ) -> tuple[Any, Any]:
-    """Return the command and what is kept after a sample; `further`: the readings of what the shape names so; `place`:
-    the scheduling variable, where there is one.
+    """Return the command and what is kept after a sample; `further`: the readings of what the shape names so;
+    `variable`: the scheduling variable, where there is one.
     """
     law, most, gain, gate, heat, around, added = ca.vertsplit(numbers, np.cumsum([0, *shape.number_sizes]).tolist())
     x, memory, seen, rises, at, outer, last = ca.vertsplit(kept, np.cumsum([0, *shape.sizes]).tolist())
@@ -198,11 +198,11 @@ def express_step(
         if shape.holds:
             moved = ca.if_else(ca.logic_and(_is_number(x_0), _is_number(position)), moved, outer)
         outer, reference = moved, force + moved[-1]
-    fault, known, measured, memory, rises = 0.0, 1.0, list(measured), ca.vertsplit(memory), ca.vertsplit(rises)
+    fault, has_last, measured, memory, rises = 0.0, 1.0, list(measured), ca.vertsplit(memory), ca.vertsplit(rises)
     if shape.gated:
         encoders = [further[shape.further.index(name)] for name in shape.encoders]
         measured[0], seen, fault = _screen(ca.vertsplit(gate), ca.vertsplit(seen), measured[0], encoders)
-        known = seen[1]
+        has_last = seen[1]
     further, limit = further[: len(shape.compensation.reads)], most * gain
     if shape.heated:
         cool = limit_current(ca.vertsplit(heat), rises, ca)
@@ -214,7 +214,7 @@ def express_step(
 
     gains, terms = dict[str, Any](), ca.vertsplit(added)
     if shape.schedule is not None:
-        at = ca.if_else(_is_number(place), place, at)
+        at = ca.if_else(_is_number(variable), variable, at)
         gains = shape.schedule.express_gains(law, at)
         terms = [gains[name] for name in shape.schedule.columns[-shape.compensation.size :] if shape.compensation.size]
     r, effort, after = compensate(shape.compensation, terms, memory, reference, further, ca)
@@ -225,7 +225,7 @@ def express_step(
     command, moved = gain * applied, ca.vertcat(following, *after)
     if shape.holds:
         usable = reduce(ca.logic_and, map(_is_number, [reference, *measured, *further]))
-        usable = ca.logic_and(ca.logic_and(usable, known), ca.logic_not(fault))
+        usable = ca.logic_and(ca.logic_and(usable, has_last), ca.logic_not(fault))
         command, moved = (ca.if_else(usable, *pair) for pair in ((command, last), (moved, ca.vertcat(x, *memory))))
     if shape.gated:
         ramp = gate[GATE_NUMBERS - 1]
@@ -252,8 +252,8 @@ def _screen(
     numbers: Sequence[Any], seen: Sequence[Any], reading: Any, encoders: Sequence[Any]
 ) -> tuple[Any, list[Any], Any]:
     """Return the reading to use, what the gate has seen, and whether that is a fault: `PlausibilityGate.screen`."""
-    (low, high, step, longest, _, *agreement), (last, known, refused) = numbers, seen
-    near = ca.logic_or(ca.logic_not(known), ca.fabs(reading - last) <= step * (refused + 1.0))
+    (low, high, step, longest, _, *agreement), (last, has_last, refused) = numbers, seen
+    near = ca.logic_or(ca.logic_not(has_last), ca.fabs(reading - last) <= step * (refused + 1.0))
     believed = ca.logic_and(ca.logic_and(reading >= low, reading <= high), near)
     if encoders:
         limit, share, *weights = agreement
@@ -263,4 +263,4 @@ def _screen(
     believed = ca.logic_and(believed, refused <= longest)  # beyond that a fault, which lasts
     used = ca.if_else(believed, reading, last)
     after = ca.if_else(believed, 0.0, ca.if_else(refused <= longest, refused + 1.0, refused))
-    return used, [used, ca.logic_or(known, believed), after], after > longest
+    return used, [used, ca.logic_or(has_last, believed), after], after > longest

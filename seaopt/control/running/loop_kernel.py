@@ -108,7 +108,7 @@ class _Structure:
     devices: tuple[_Device, ...]  # one per measured output
     encoders: tuple[tuple[str, _Device], ...]  # with errors, of those that the reading is computed from
     sticks: bool
-    place: str | None  # which state a schedule is over, of a plant that has it
+    over: str | None  # which state a schedule is over, of a plant that has it
 
     @property
     def columns(self) -> int:
@@ -126,7 +126,7 @@ def _structure_of(loop: SampledLoop, job: Job) -> _Structure:
         devices=tuple(_describe_device(sensors, name)[0] for name in names),
         encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
         sticks=loop.sticks,
-        place=loop.place if loop.place in loop.plant.states else None,
+        over=loop.over if loop.over in loop.plant.states else None,
     )
 
 
@@ -156,8 +156,8 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
                 reading += weights[name] * (encoder.read(outputs[name], devices[:, number]) - outputs[name])
         readings.append(device.read(reading, devices[:, column]))
     further = [readings[structure.measured.index(name)] for name in law.further]
-    place = w[-1] if structure.place is None else plant.x[list(plant.states).index(structure.place)]
-    current, after = express_step(law, numbers, z[:kept], r, readings[: law.measured], further, place)
+    variable = w[-1] if structure.over is None else plant.x[list(plant.states).index(structure.over)]
+    current, after = express_step(law, numbers, z[:kept], r, readings[: law.measured], further, variable)
     if structure.rounds_current:
         step, most = ca.vertsplit(amplifier)
         current = step * ca.floor(current / step + 0.5)

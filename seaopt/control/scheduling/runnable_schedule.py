@@ -49,11 +49,11 @@ class ScheduleShape:
         """How many numbers it takes."""
         return self.points * (1 + len(self.columns))
 
-    def express_gains(self, numbers: Any, place: Any) -> dict[str, Any]:
+    def express_gains(self, numbers: Any, variable: Any) -> dict[str, Any]:
         """Return the gains at a place, as `GainTable.find_numbers` does."""
         count = len(self.columns)
         points, rows = numbers[: self.points], ca.reshape(numbers[self.points :], count, self.points)
-        inside = ca.fmin(ca.fmax(place, points[0]), points[-1])
+        inside = ca.fmin(ca.fmax(variable, points[0]), points[-1])
         first, *further = (
             ca.vertcat(points[i], points[i + 1], rows[:, i], rows[:, i + 1]) for i in range(self.points - 1)
         )
@@ -235,13 +235,13 @@ def name_terms(terms: Float[np.ndarray, "n c"] | None) -> list[str]:
 def _compile_step(law: RunnableSchedule, _thread: int) -> DirectCall:
     """Return a law's step of place, x, reference, measured, limit and added effort, which a thread has to itself."""
     shape, y = law.shape, law.measured
-    place, r, most, added = (ca.SX.sym(name) for name in ("place", "r", "most", "added"))
+    variable, r, most, added = (ca.SX.sym(name) for name in ("place", "r", "most", "added"))
     x, measured = ca.SX.sym("x", len(shape.states)), ca.SX.sym("y", y)
-    gains = shape.express_gains(ca.SX(ca.DM(law.numbers)), place)
+    gains = shape.express_gains(ca.SX(ca.DM(law.numbers)), variable)
     step = shape.express_step(
         gains, x, r, ca.vertsplit(measured), lambda effort: ca.fmin(ca.fmax(effort, -most), most), added
     )
-    return DirectCall(ca.Function("step", [place, x, r, measured, most, added], [ca.densify(part) for part in step]))
+    return DirectCall(ca.Function("step", [variable, x, r, measured, most, added], [ca.densify(part) for part in step]))
 
 
 def make_runnable(

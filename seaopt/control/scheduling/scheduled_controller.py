@@ -130,7 +130,7 @@ class ScheduledController(Result, Worded):
     def met(self) -> bool:
         """Whether every limit is met at the points, and where it was looked between them."""
         return all(controller.met for controller in self.controllers) and not any(
-            place.broken for place in self.between
+            figures.broken for figures in self.between
         )
 
     @property
@@ -140,9 +140,9 @@ class ScheduledController(Result, Worded):
         for point, controller in self._pairs:
             for name in () if controller.met else controller.active_constraints:
                 places.setdefault(name, []).append(point)
-        for place in self.between:
-            for name in place.broken:
-                places.setdefault(name, []).append(place.value)
+        for figures in self.between:
+            for name in figures.broken:
+                places.setdefault(name, []).append(figures.value)
         texts: list[str] = []
         for name, values in places.items():
             more = f" and {format_count(len(values) - 1, 'more value')}" if len(values) > 1 else ""
@@ -168,7 +168,7 @@ class ScheduledController(Result, Worded):
         for point, controller in self._pairs:
             if not controller.met:
                 return f"at {self.over} = {point:g}: {controller.explanation}"
-        missed = [place.value for place in self.between if place.broken]
+        missed = [figures.value for figures in self.between if figures.broken]
         if not missed:
             return ""
         stretches = pairwise(self.points)
@@ -241,20 +241,20 @@ class ScheduledController(Result, Worded):
 
     def _judge_place(self, value: float) -> PlaceFigures:
         """Judge the law at a value between the points: all limits, and 0.9 of the bandwidth that is asked there."""
-        asked, spec = self.asked_hz(value), replace(self.spec, bandwidth_hz=self.asked_hz(value))
+        asked_hz, spec = self.asked_hz(value), replace(self.spec, bandwidth_hz=self.asked_hz(value))
         frozen, loops = self._freeze(value, spec)
         measured = {loop.name: loop.figures for loop in loops}
-        others = place_plants(self.others, self.over, value).items()
-        closed = (measured.get(name) or close_outer(frozen, *case).figures() for name, case in others)
+        cases = place_plants(self.others, self.over, value).items()
+        closed = (measured.get(name) or close_outer(frozen, *case).figures() for name, case in cases)
         worst = [loops[0].figures, *closed]
         band = frozen.achieved.bandwidth_hz
         broken = () if frozen.met else frozen.active_constraints
-        if band is None or band < LEAST_BANDWIDTH * asked:
+        if band is None or band < LEAST_BANDWIDTH * asked_hz:
             broken = (*broken, f"{LEAST_BANDWIDTH:g} of bandwidth_hz")
         return PlaceFigures(
             value=value,
             bandwidth_hz=band,
-            asked_hz=asked,
+            asked_hz=asked_hz,
             ms=max(figures.ms for figures in worst),
             mt=max(figures.mt for figures in worst),
             broken=broken,
@@ -411,10 +411,10 @@ def make_table(over: str, unit: str, points: tuple[float, ...], controllers: tup
     )
 
 
-def is_alike(terms: Compensation | None, others: Compensation | None) -> bool:
+def is_alike(terms: Compensation | None, other: Compensation | None) -> bool:
     """Tell whether two compensations differ in what is interpolated alone."""
-    return terms is others or (
-        terms is not None and others is not None and terms.shape == others.shape and terms.mix(others, 1.0) == others
+    return terms is other or (
+        terms is not None and other is not None and terms.shape == other.shape and terms.mix(other, 1.0) == other
     )
 
 
@@ -423,7 +423,7 @@ def freeze(
     value: float,
     spec: ControllerSpec,
     design: tuple[Plant, ParameterSet],
-    others: Plants,
+    robust_to: Plants,
     outer: OuterLoop | None = None,
     draws: Draws = (),
 ) -> tuple[Controller, list[MeasuredLoop]]:
@@ -432,7 +432,7 @@ def freeze(
     bandwidth it has. `outer` runs around it.
     """
     plant, params = design[0], place_variable(*design, table.over, value)
-    task = make_place_task(table, value, spec, design, place_plants(others, table.over, value), outer, draws)
+    task = make_place_task(table, value, spec, design, place_plants(robust_to, table.over, value), outer, draws)
     gains, law = table.find_gains(value), table.law(value)
     loops = task.measure_law(
         law,
@@ -453,13 +453,13 @@ def make_place_task(
     value: float,
     spec: ControllerSpec,
     design: tuple[Plant, ParameterSet],
-    others: RobustTo,
+    robust_to: RobustTo,
     outer: OuterLoop | None = None,
     draws: Draws = (),
 ) -> Task:
     """Return the task in which a table's law is measured at a value, beside plants that are placed there."""
     plant, params = design[0], place_variable(*design, table.over, value)
-    task = make_task(plant, plant.complete(params), spec, others, draws)
+    task = make_task(plant, plant.complete(params), spec, robust_to, draws)
     task = feed_link(task, table.find_gains(value).link)
     return task if outer is None else task.enclosed(outer, command_of(plant, params, spec.regulated).per_effort)
 

@@ -135,13 +135,13 @@ def tune_schedule(
     robust_to = take_own_delays(spec, plant, robust_to or {}, params)
     spec, values = settle_delays(spec, plant, params)
     responses = {name: plant for name, plant in robust_to.items() if isinstance(plant, MeasuredResponse)}
-    others = _pair_plants(robust_to, values)
-    kept = {**others, **(witnesses or {})}
+    robust_pairs = _pair_plants(robust_to, values)
+    kept = {**robust_pairs, **(witnesses or {})}
     if over in DELAYS:
         raise ControlError(f'over = "{over}": a delay cannot be read as the law runs; give a state or a parameter')
     if any(over in draw for draw in draws):
         raise ControlError(f'draws have "{over}", which the schedule is over; take it out of the draws')
-    unit = find_unit(over, {"the design plant": plant, **{name: other for name, (other, _) in others.items()}})
+    unit = find_unit(over, {"the design plant": plant, **{name: other for name, (other, _) in robust_pairs.items()}})
     placed: list[tuple[ParameterSet, RobustTo]] = [
         (place_variable(plant, values, over, value), place_plants(kept, over, value)) for value in places.tolist()
     ]
@@ -171,7 +171,7 @@ def tune_schedule(
             unit=unit,
             points=tuple(places.tolist()),
             controllers=tuple(controllers),
-            others=others,
+            others=robust_pairs,
             fallback=float(places[0]),
             draws=tuple(draws),
         ).with_places()
@@ -180,7 +180,7 @@ def tune_schedule(
     chains = _rank_chains(tasks, None if near is None else _follow_schedule(tasks, points, near), alone)
     found, *further = [_FoundChain.of(tasks, chain) for chain in chains]
     if _count_hops(chains[0]) and not make(found).met:
-        found = min([found, *further], key=lambda each: sum(bool(place.broken) for place in make(each).between))
+        found = min([found, *further], key=lambda each: sum(bool(figures.broken) for figures in make(each).between))
     if outer is not None:
         found = meet_outer(found, make, outer, around)
     schedule = make(found)
@@ -250,15 +250,15 @@ def find_response_place(over: str, name: str, response: MeasuredResponse, values
     )
 
 
-def _find_point(over: str, points: Sequence[float], name: str, place: float) -> int:
+def _find_point(over: str, points: Sequence[float], name: str, taken: float) -> int:
     """Return the point at which a measured response was taken."""
-    if place not in points:
-        more = ", ".join(f"{value:g}" for value in sorted({*points, place}))
+    if taken not in points:
+        more = ", ".join(f"{value:g}" for value in sorted({*points, taken}))
         raise ControlError(
-            f"robust_to: {name} is a measured response, which was taken at {over} = {place:g}, and no point is there; "
+            f"robust_to: {name} is a measured response, which was taken at {over} = {taken:g}, and no point is there; "
             f"give points = [{more}], or the value of {over} it was taken at among the parameters"
         )
-    return points.index(place)
+    return points.index(taken)
 
 
 def _specify(spec: ControllerSpec, points: Any, bandwidths_hz: Sequence[float] | None) -> list[ControllerSpec]:
@@ -322,17 +322,17 @@ def _follow_schedule(tasks: Sequence[Task], points: Sequence[float], near: Sched
     """Return the numbers reached at every point from those of a schedule of all, or of some; None where these break a
     limit, or there are none. What a scan has at one point alone may be of another valley than its neighbours.
     """
-    known = [k for k, point in enumerate(points) if point in near.points]
+    shared = [k for k, point in enumerate(points) if point in near.points]
     reached: dict[int, Solution] = {}
-    if not known:
+    if not shared:
         return None
-    for k in (*range(known[0], len(tasks)), *reversed(range(known[0]))):
+    for k in (*range(shared[0], len(tasks)), *reversed(range(shared[0]))):
         task = tasks[k]
-        if k in known:
+        if k in shared:
             gains = near.controllers[near.points.index(points[k])].gains
             start = read_numbers(gains, task.k_ff, task.spec.sample_time_s)
         else:
-            start = reached[k - 1 if k > known[0] else k + 1][0]
+            start = reached[k - 1 if k > shared[0] else k + 1][0]
         x = _follow(task, start)
         reached[k] = x, task.measure(x)
         if _breaks_limits(task, reached[k][1]):

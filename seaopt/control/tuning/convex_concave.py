@@ -214,7 +214,7 @@ def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) ->
         ends: list[Float[np.ndarray, " c"]] = []
         for sign in (1.0, -1.0):
             c_y, c_r = (c[column] + sign * step * by for c, by in ((law.law.c_y, by_y), (law.law.c_r, by_r)))
-            ends.append(use_disc(curve, level, p, discs, c_y, c_r, path.add_rest(c_v, c_r)))
+            ends.append(use_disc(curve, level, p, discs, c_y, c_r, path.add_constant(c_v, c_r)))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     return slope
 

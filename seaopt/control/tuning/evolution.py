@@ -139,7 +139,7 @@ class Evolution:
         terms = task.terms(at, wide)
         series, integral, rate, more, ahead, prefilter = (np.ravel(np.broadcast_to(t, (len(x), 1))) for t in terms)
         plant = at.plants.alone.at(0)
-        through, back = plant.y * series, plant.add_rest(x[:, K_V] * series * task.sense(at.q), 0.0 * series)
+        through, back = plant.y * series, plant.add_constant(x[:, K_V] * series * task.sense(at.q), 0.0 * series)
         kappa = 1.0 + rho * integral
         slope = task.k_ff * (ahead / series - sigma) + rho * integral + (x[:, K_D] - x[:, W_C]) * rate
         reached = back + through * (rho * integral + x[:, K_D] * rate + more)

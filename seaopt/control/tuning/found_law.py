@@ -120,17 +120,17 @@ def meet_outer(
     for number in range(OUTER_ROUNDS + 1):
         law = describe(found)
         try:
-            asked = outer(law)
+            required = outer(law)
         except SeaoptError:
             if law.met and not tried:
                 raise
             break  # around a law that misses its limits, or one that follows, there may be none
-        if asked is None:
+        if required is None:
             break
-        if asked == law.outer:
+        if required == law.outer:
             tried.append(found)
             break
-        found = found.enclose(asked, law.command.per_effort)
+        found = found.enclose(required, law.command.per_effort)
         tried.append(found)
         if not found.missed or number == OUTER_ROUNDS:
             break

@@ -45,14 +45,14 @@ class Path:
     v: ComplexArray
     r: ComplexArray | None = None
 
-    def add_rest(self, c_v: ComplexArray, c_r: ComplexArray) -> ComplexArray:
+    def add_constant(self, c_v: ComplexArray, c_r: ComplexArray) -> ComplexArray:
         """Return the sum without the regulated signal."""
-        rest = self.fixed + self.v * c_v
-        return rest if self.r is None else rest + self.r * c_r
+        constant = self.fixed + self.v * c_v
+        return constant if self.r is None else constant + self.r * c_r
 
     def add_up(self, c_y: ComplexArray, c_v: ComplexArray, c_r: ComplexArray) -> ComplexArray:
         """Return the sum of a law."""
-        return self.add_rest(c_v, c_r) + self.y * c_y
+        return self.add_constant(c_v, c_r) + self.y * c_y
 
     def change(self, by_y: ComplexArray, by_v: ComplexArray, by_r: ComplexArray) -> ComplexArray:
         """Return the change of the sum with those of C_y, C_v and C_r."""
@@ -152,10 +152,10 @@ def use_disc(
     discs: Float[np.ndarray, "..."],
     c_y: ComplexArray,
     c_r: ComplexArray,
-    rest: ComplexArray,
+    constant: ComplexArray,
 ) -> Float[np.ndarray, "..."]:
     """Return the usage of a limit by the worst of the responses in discs."""
-    least, most = bound_disc(curve.of, p, discs, c_y, c_r, rest)
+    least, most = bound_disc(curve.of, p, discs, c_y, c_r, constant)
     return level / np.maximum(least, LEAST_RESPONSE) if curve.floor else most / level
 
 

@@ -361,7 +361,7 @@ def _solve(
         bottoms += [grid.plants.at((plant, padded)) for plant in worst]
     column = np.concatenate(columns)
     p, fixed, speed = (np.concatenate([getattr(path, part) for path in bottoms]) for part in ("y", "fixed", "v"))
-    asked = np.concatenate([0.0 * path.y if path.r is None else path.r for path in bottoms])
+    outer = np.concatenate([0.0 * path.y if path.r is None else path.r for path in bottoms])
     at = task.find_bandwidth(grid)
     low, high = task.bounds(start)
     sizes = np.abs(start)
@@ -380,7 +380,7 @@ def _solve(
         sense = task.sense(grid.q)
         every += [(fixed, design.fixed), (speed, design.v), (sense[column], sense)]
     if grid.plants.r is not None:
-        every.append((asked, 0.0 * design.y))  # the bandwidth is the force law's
+        every.append((outer, 0.0 * design.y))  # the bandwidth is the force law's
     data = [
         *(part for z, _ in every for part in (np.real(z), np.imag(z))), weights, np.log(np.concatenate(levels)),
         [part for _, z in every for part in (z[at].real, z[at].imag)], [spec.sample_time_s], [task.k_ff], scale,

@@ -454,15 +454,15 @@ class Task:
         self, names: Sequence[str], grid: Grid, path: Path, plants: int | slice, law: LawResponse
     ) -> dict[str, np.ndarray]:
         """Return the usage of limits on plants with one path."""
-        discs, p, rest = grid.discs[plants], path.y, path.add_rest(law.c_v, law.c_r)
-        open_loop = rest - 1.0 + p * law.c_y
+        discs, p, constant = grid.discs[plants], path.y, path.add_constant(law.c_v, law.c_r)
+        open_loop = constant - 1.0 + p * law.c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
         measured = bool(np.any(discs))
         for name in names:
             curve, level = CURVES[name], grid.levels[name]
             if measured:
-                out[name] = use_disc(curve, level, p, discs, law.c_y, law.c_r, rest)
+                out[name] = use_disc(curve, level, p, discs, law.c_y, law.c_r, constant)
                 continue
             size = np.abs(curve.numerator(p, law.c_y, law.c_r, open_loop, law.c_v))
             out[name] = level * distance / np.maximum(size, 1e-12) if curve.floor else size / (level * distance)

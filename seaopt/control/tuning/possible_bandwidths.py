@@ -62,27 +62,27 @@ def find_possible_bandwidths(
     return _Probes(task, x, progress).find()
 
 
-def list_steps(asked: float, end: float) -> list[float]:
+def list_steps(bandwidth_hz: float, end: float) -> list[float]:
     """Return the bandwidths to probe from the one asked, which is not among them, to an end of the range."""
-    count = int(np.ceil(abs(np.log(end / asked)) / np.log(PROBE_RATIO)))
-    return [float(f) for f in np.geomspace(asked, end, count + 1)[1:]]
+    count = int(np.ceil(abs(np.log(end / bandwidth_hz)) / np.log(PROBE_RATIO)))
+    return [float(f) for f in np.geomspace(bandwidth_hz, end, count + 1)[1:]]
 
 
 def find_end(
-    keeps: Callable[[float], bool], steps: Sequence[float], outside: float | None, asked: float | None = None
+    keeps: Callable[[float], bool], steps: Sequence[float], outside: float | None, centre: float | None = None
 ) -> float | None:
     """Return the first bandwidth that keeps the limits, moved towards the one before, which does not.
 
-    `outside`: the one before the first step, if there is any; `asked`: which the resolution depends on, if not on that.
+    `outside`: the one before the first step, if there is any; `centre`: what the resolution depends on, else that one.
     """
-    asked = asked or outside
+    centre = centre or outside
     for inside in steps:
         if keeps(inside):
             break
         outside = inside
     else:
         return None
-    resolution = max(RESOLUTION, FAR_RESOLUTION * abs(np.log(inside / (asked or inside))))
+    resolution = max(RESOLUTION, FAR_RESOLUTION * abs(np.log(inside / (centre or inside))))
     while outside is not None and abs(np.log(outside / inside)) > resolution:
         middle = float(np.sqrt(inside * outside))
         inside, outside = (middle, outside) if keeps(middle) else (inside, middle)
@@ -96,18 +96,18 @@ class _Probes:
 
     def __init__(self, task: Task, x: LawNumbers, progress: Progress) -> None:
         self.progress, self.expected = progress, 1
-        self.task, self.asked = task.aim_multipliers(x), task.spec.bandwidth_hz
-        self.tried: dict[float, tuple[float, LawNumbers]] = {self.asked: (np.inf, x)}
+        self.task, self.bandwidth_hz = task.aim_multipliers(x), task.spec.bandwidth_hz
+        self.tried: dict[float, tuple[float, LawNumbers]] = {self.bandwidth_hz: (np.inf, x)}
 
     def find(self) -> tuple[PossibleBandwidths, list[LawNumbers]]:
         """Return what `find_possible_bandwidths` does."""
         spec = self.task.spec
-        lowest = max(self.asked / FARTHEST_BELOW, 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
-        highest = min(max(self.asked * FARTHEST_ABOVE, USUAL_HZ), HIGHEST_BANDWIDTH * spec.sample_rate_hz)
-        down, up = (list_steps(self.asked, end) for end in (lowest, highest))
+        lowest = max(self.bandwidth_hz / FARTHEST_BELOW, 1.01 * (spec.min_sensitivity_bandwidth_hz or 0.0))
+        highest = min(max(self.bandwidth_hz * FARTHEST_ABOVE, USUAL_HZ), HIGHEST_BANDWIDTH * spec.sample_rate_hz)
+        down, up = (list_steps(self.bandwidth_hz, end) for end in (lowest, highest))
         self.expected = len(down) + len(up) + BISECTIONS
-        below, above = (find_end(self._keeps, steps, self.asked) for steps in (down, up))
-        largest = below if above is None else find_end(self._keeps, [*reversed(up), above], None, self.asked)
+        below, above = (find_end(self._keeps, steps, self.bandwidth_hz) for steps in (down, up))
+        largest = below if above is None else find_end(self._keeps, [*reversed(up), above], None, self.bandwidth_hz)
         nearest = tuple(f for f in (below, above) if f is not None)
         missed, closest = min((usage, f) for f, (usage, _) in self.tried.items())
         possible = PossibleBandwidths(nearest_hz=nearest, largest_hz=largest)

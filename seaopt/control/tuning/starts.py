@@ -229,7 +229,7 @@ class _Scan:
     @property
     def rest(self) -> complex:
         """B of the design plant at the bandwidth."""
-        return complex(self.grid.plants.alone.at(0).add_rest(self.c_v, 0.0 * self.c_v)[self.at])
+        return complex(self.grid.plants.alone.at(0).add_constant(self.c_v, 0.0 * self.c_v)[self.at])
 
     @property
     def inverse(self) -> float:

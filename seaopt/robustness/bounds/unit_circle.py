@@ -156,7 +156,7 @@ def _pack(model: Taylor, box: Int[np.ndarray, " p"]) -> Packed:
 def expand_controller(controller: Controller) -> LawPolynomials:
     """Return the polynomials of a controller's law."""
     law = controller.law
-    m, (a, b, c) = law.integrators, law.rest
+    m, (a, b, c) = law.integrators, law.remainder
     delta, q = np.array([0.0, 1.0]), np.array([1.0, -1.0])
 
     def characteristic(matrix: Float[np.ndarray, "n n"]) -> Coefficients:

@@ -269,12 +269,12 @@ def compensation_requirements(
         if drawn is not None and drawn.least_slope < value:
             value, draw, said = drawn.least_slope, DrawnAt(parameters=drawn.parameters), []
         if friction is not None and value:
-            said.append(f"shown up to {value / margin.asked * friction.fraction:.3g} of the friction")
+            said.append(f"shown up to {value / margin.required * friction.fraction:.3g} of the friction")
         rows.append(
             require_at_least(
                 FRICTION_COMPENSATION,
                 value,
-                margin.asked,
+                margin.required,
                 unit=controller.command.mechanics.damping,
                 plant=name,
                 draw=draw,

@@ -83,7 +83,7 @@ def test_a_slow_lag_is_no_integrator():
     a, b = np.array([[1.0, 0.3], [0.0, 1.0 - 1e-6]]), np.array([[0.2, -0.2], [1.0, -1.0]])
     law = Law.from_state_space(a, b, np.array([1.0, 0.5]), np.zeros(2), TS)
     assert law.integrators == 1
-    assert np.min(np.abs(np.linalg.eigvals(law.rest[0]) - (1.0 - 1e-6))) < 1e-12
+    assert np.min(np.abs(np.linalg.eigvals(law.remainder[0]) - (1.0 - 1e-6))) < 1e-12
 
 
 def test_python_control_laws_are_taken_as_they_are():

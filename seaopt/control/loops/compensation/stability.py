@@ -104,7 +104,7 @@ class CompensationMargin:
     # the steepest, N s/m (N m s/rad) of effort over the friction's velocity: fraction times Coulomb friction over the
     # speed of the smoothing. Infinite where none is bounded, zero where nothing is shown
     slope: float
-    asked: float  # the compensation's own
+    required: float  # the slope of the compensation itself
     frequency_hz: float  # where the test fails first with a steeper one
     multiplier: str  # with which it holds, of friction; why not, where nothing is shown
     shift: str = ""  # the compensation's part of it
@@ -113,12 +113,12 @@ class CompensationMargin:
     @property
     def shown(self) -> bool:
         """Whether stability is shown for the compensation as it is."""
-        return self.slope >= self.asked
+        return self.slope >= self.required
 
     @property
     def factor(self) -> float:
         """The steepest slope over the compensation's own."""
-        return self.slope / self.asked
+        return self.slope / self.required
 
     def __str__(self) -> str:
         if not self.slope:
@@ -130,17 +130,19 @@ class CompensationMargin:
 
 
 def compensation_margin(
-    loop: FrictionLoop, reading: SpeedReading, asked: float, first: str = "", enough: float = np.inf
+    loop: FrictionLoop, reading: SpeedReading, required: float, first: str = "", enough: float = np.inf
 ) -> CompensationMargin:
     """Return the steepest compensation for which the test of stability holds, the best over all multipliers. `loop`:
-    stable, with its friction taken out and without compensation. `asked`: the compensation's slope, N s/m (N m s/rad).
-    `first`: a multiplier that is tried first. `enough`: a slope of so many times `asked` ends the search.
+    stable, with its friction taken out and without compensation. `required`: the slope of the compensation, N s/m (N m
+    s/rad). `first`: a multiplier that is tried first. `enough`: a slope of so many times `required` ends the search.
     """
     if obstacle := find_obstacle(loop):
-        return CompensationMargin(slope=0.0, asked=asked, frequency_hz=0.0, multiplier=obstacle)
-    search = _Search(loop=loop, reading=reading, asked=asked, base=_Readings.at(loop, reading, choose_angles(loop)))
+        return CompensationMargin(slope=0.0, required=required, frequency_hz=0.0, multiplier=obstacle)
+    search = _Search(
+        loop=loop, reading=reading, required=required, base=_Readings.at(loop, reading, choose_angles(loop))
+    )
     best = CompensationMargin(
-        slope=0.0, asked=asked, frequency_hz=0.0, multiplier="it is not without compensation either"
+        slope=0.0, required=required, frequency_hz=0.0, multiplier="it is not without compensation either"
     )
     for name, multiplier in sorted(list_multipliers(loop), key=lambda named: named[0] != first):
         form = _MultiplierTest.of(search.base, multiplier)
@@ -150,7 +152,7 @@ def compensation_margin(
             margin = search.measure(form, multiplier, shift, best.slope)
             if margin is not None and margin.slope > best.slope:
                 best = replace(margin, multiplier=name, shift=shift)
-            if best.slope >= enough * asked:
+            if best.slope >= enough * required:
                 return best
     return best
 
@@ -229,7 +231,7 @@ class _Search:
 
     loop: FrictionLoop
     reading: SpeedReading
-    asked: float
+    required: float
     base: _Readings
 
     def measure(
@@ -254,7 +256,7 @@ class _Search:
         slope = np.inf if needed <= 0.0 else 1.0 / (MARGIN_KEPT * needed)
         return CompensationMargin(
             slope=float(slope),
-            asked=self.asked,
+            required=self.required,
             multiplier=shift,
             angles=count,
             frequency_hz=float(worst / (2 * np.pi * self.loop.plant.sample_time_s)),

@@ -152,7 +152,7 @@ def bound_disc(
     of: str, p: Any, r: Any, c_y: Any, c_r: Any, constant: Any = 1.0
 ) -> tuple[Float[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
     """Return the least and the largest abs(X)/abs(1 + L) of the responses in discs; see the module's table. 1 + L is
-    `rest` + P C_y: of a model, without a disc, what the law reads besides is in the rest.
+    `constant` + P C_y: of a model, without a disc, it holds what the law reads besides.
     """
     open_loop = constant - 1.0 + p * c_y
     a, reach = 1.0 + open_loop, r * np.abs(c_y)
