@@ -79,29 +79,29 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     ]
     is_table = first["type"] == "string_type" or isinstance(first["input"], Mapping)
     first = inside[0] if inside and is_table else first
-    place = _place(first["loc"])
-    key = place.rpartition(".")[2]
+    path = _place(first["loc"])
+    key = path.rpartition(".")[2]
     if first["type"] == "extra_forbidden":
         keys = [field.alias or name for name, field in _find_model(model, first["loc"]).model_fields.items()]
         near = get_close_matches(str(first["loc"][-1]), keys, n=1, cutoff=0.6)
         line = f" write {near[0]} = {_spell(first['input'])}" if near else ""
-        return f"unknown key {place}; {suggestion(str(first['loc'][-1]), keys)}{line}"
+        return f"unknown key {path}; {suggestion(str(first['loc'][-1]), keys)}{line}"
     if _is_range(first):
         at = _place(first["loc"][:-1] if first["type"] == "missing" else first["loc"])
         return (
             f"{at} = {shorten(first['input'])} is not a range; give [low, high]: {at.rpartition('.')[2]} = [1.0, 2.0]"
         )
     if first["type"] == "missing":
-        return f"key {place} is missing; {remedy or f'add it: {key} = {_suggest_value(model, first)}'}"
+        return f"key {path} is missing; {remedy or f'add it: {key} = {_suggest_value(model, first)}'}"
     words = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
     words = words.replace("List should", "should").replace(" after validation", "")
     words = "should be a table" if first["type"] == "model_type" else words
     if not first["loc"]:  # of the whole file
         return f"{words}; {remedy or 'correct the file'}"
     if first["type"] == "value_error" and isinstance(first["input"], Mapping):  # what a whole table says wrongly
-        return f"{place}: {words}; {remedy or 'correct that table'}"
+        return f"{path}: {words}; {remedy or 'correct that table'}"
     if isinstance(first["loc"][-1], int):  # an entry of a list has no key to write
-        return f"{place} = {shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
+        return f"{path} = {shorten(first['input'])}: {words}; {remedy or 'correct that entry'}"
     kind = first["type"].partition("_")[0]
     if kind in ("greater", "less"):
         correct = f"correct it: {key} = {_suggest_number(model, first)}"
@@ -113,7 +113,7 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
         correct = f"correct it: {key} = {_suggest_choice(first)}"
     else:
         correct = f"correct it: {key} = {EXAMPLES.get(kind, '...')}"
-    return f"{place} = {shorten(first['input'])}: {words}; {remedy or correct}"
+    return f"{path} = {shorten(first['input'])}: {words}; {remedy or correct}"
 
 
 def _suggest_number(model: type[BaseModel], mistake: Mapping[str, Any]) -> str:

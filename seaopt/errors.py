@@ -106,17 +106,17 @@ class InternalError(Exception):
         places = [
             frame for frame in traceback.extract_tb(error.__traceback__) if package in Path(frame.filename).parents
         ]
-        place = "".join(f" at {Path(frame.filename).relative_to(package)}:{frame.lineno}" for frame in places[-1:])
+        where = "".join(f" at {Path(frame.filename).relative_to(package)}:{frame.lineno}" for frame in places[-1:])
         reason = " ".join(str(error).split()) or "no text"
         out = cls(
-            f"{call} came upon a defect of seaopt, {type(error).__name__}{place}: {reason}; please report it with the "
+            f"{call} came upon a defect of seaopt, {type(error).__name__}{where}: {reason}; please report it with the "
             "request below, and change the request a little to go on"
         )
         out.add_note(request)
         return out
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
+def suggestion(name: str, valid: Iterable[str]) -> str:
     """Return what to say after an unknown `name`: the nearest known one, or all of them.
 
     Examples
@@ -126,7 +126,7 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     >>> suggestion("zzz", ["J", "b_r"])
     'known: J, b_r'
     """
-    names = list(known)
+    names = list(valid)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
     if near:
         return f'did you mean "{near[0]}"?'

@@ -120,13 +120,15 @@ def check_distinct(channels: Mapping[str, tuple[tuple[str, str], str]]) -> list[
     """
     seen: dict[tuple[str, str], dict[str, str]] = {}
     notes: list[str] = []
-    for name, (place, unit) in channels.items():
-        for other, known in seen.get(place, {}).items():
-            if known == unit:
+    for name, (column, unit) in channels.items():
+        for other, other_unit in seen.get(column, {}).items():
+            if other_unit == unit:
                 raise LogError(
-                    f'{place[0]}: column "{place[1]}" is given for {other} and for {name}; each channel needs a column '
-                    "of its own: choose another for one of them, leave it out, or give a file's column shared = true"
+                    f'{column[0]}: column "{column[1]}" is given for {other} and for {name}; each channel needs a '
+                    "column of its own: choose another for one of them, leave it out, or give a file's column shared = true"
                 )
-            notes.append(f'{other} and {name} are the same column "{place[1]}", in {known or "-"} and in {unit or "-"}')
-        seen.setdefault(place, {})[name] = unit
+            notes.append(
+                f'{other} and {name} are the same column "{column[1]}", in {other_unit or "-"} and in {unit or "-"}'
+            )
+        seen.setdefault(column, {})[name] = unit
     return notes

@@ -165,12 +165,12 @@ def _list_planned(folder: Path, path: Path) -> list[dict[str, Any]]:
     try:
         stages = read_json(folder / BRING_UP / PLAN, BRINGUP_SCHEMA)["stages"]
         laws = [read_json(folder / BRING_UP / each["name"] / path.name, SCHEMAS["tune"]) for each in stages]
-        own = read_json(path, SCHEMAS["tune"])
+        final = read_json(path, SCHEMAS["tune"])
     except SeaoptError:  # none was planned, or it was edited
         return []
     same = ("law", "schedule", "mpc")
     pairs = zip(stages, laws, strict=True)
-    return [stage for stage, law in pairs if all(law.get(key) == own.get(key) for key in same)]
+    return [stage for stage, law in pairs if all(law.get(key) == final.get(key) for key in same)]
 
 
 def _find_certificate(
@@ -231,22 +231,22 @@ def _list_units(controller: Controller) -> dict[str, str]:
     return {REFERENCE: reference, command.input: command.unit, **read}
 
 
-def _find_others(session: Session, folder: Path, own: Path) -> dict[str, Source]:
+def _find_others(session: Session, folder: Path, excluded: Path) -> dict[str, Source]:
     """Return the other controllers that lie in a folder, and two levels below, by their files; predictive control that
     other parameters made by its linear law.
     """
-    others: dict[str, Source] = {}
+    controllers: dict[str, Source] = {}
     for path in sorted([*folder.glob("*.json"), *folder.glob("*/*.json"), *folder.glob(f"{BRING_UP}/*/*.json")]):
-        if path == own or not path.is_file():
+        if path == excluded or not path.is_file():
             continue
         try:
             content = read_json(path, SCHEMAS["tune"])
             kind = ScheduledController if content.get("schedule") else Controller
             plan = _read_plan(session, content)
-            others[str(path.relative_to(folder))] = kind.read(content) if plan is None else plan
+            controllers[str(path.relative_to(folder))] = kind.read(content) if plan is None else plan
         except SeaoptError:  # another kind of file, or of another version
             continue
-    return others
+    return controllers
 
 
 def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[str, Any]:

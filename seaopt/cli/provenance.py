@@ -110,10 +110,10 @@ def _shape_by_robustness(problem: Problem, retune: int) -> dict[str, Any]:
 def _describe_plants(problem: Problem, names: set[str]) -> dict[str, Any]:
     """Return plants and the values of their parameters."""
     plants = problem.with_partners(names)
-    known = dict.fromkeys(name for each in sorted(plants) for name in problem.plants[each].parameters)
+    used = dict.fromkeys(name for each in sorted(plants) for name in problem.plants[each].parameters)
     return {
         "plant": {name: problem.table.plant[name].model_dump(mode="json") for name in sorted(plants)},
-        "values": {name: problem.parameters[name].value for name in known},
+        "values": {name: problem.parameters[name].value for name in used},
     }
 
 

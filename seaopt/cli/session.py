@@ -269,9 +269,9 @@ class Session:
         return self.folder / FILES[stage]
 
     def _check_spec(self, stored: ControllerSpec) -> None:
-        asked = self._spec()
+        current = self._spec()
         # What was tuned again for the draws of its certificate may have more of a reserve than the file asks.
-        spec = replace(asked, reserve=max(asked.reserve, stored.reserve)).to_dict()
+        spec = replace(current, reserve=max(current.reserve, stored.reserve)).to_dict()
         stated = OF_THE_LAW if stored.structure == CUSTOM else ()
         for name, value in stored.to_dict().items():
             if name not in stated and value != spec.get(name):

@@ -35,12 +35,12 @@ REMEDIES: dict[int | None, str] = {
 
 
 class Dispatcher:
-    """The logs that wait, and the batches that are in flight; `known` is as in `fit_batch`."""
+    """The logs that wait, and the batches that are in flight; `digests` is as in `fit_batch`."""
 
-    def __init__(self, executor: Executor, plan: Plan, logs: Sequence[FleetLog], known: Mapping[str, str]) -> None:
+    def __init__(self, executor: Executor, plan: Plan, logs: Sequence[FleetLog], digests: Mapping[str, str]) -> None:
         self.executor = executor
         self.plan = plan
-        self.known = known
+        self.digests = digests
         self.waiting = deque(logs)
         self.suspects: deque[FleetLog] = deque()
         self.deaths: dict[str, int] = {}
@@ -84,7 +84,7 @@ class Dispatcher:
         return max(1, min(int(BATCH_S / max(self.log_s, 1e-9)), LARGEST, share))
 
     def _submit(self, batch: tuple[FleetLog, ...]) -> None:
-        done = {log.path: self.known[log.path] for log in batch if log.path in self.known}
+        done = {log.path: self.digests[log.path] for log in batch if log.path in self.digests}
         patience = PATIENCE_S if hasattr(self.executor, "_client") else 0.0  # a scheduler that restarts is back soon
         end = monotonic() + patience
         while True:

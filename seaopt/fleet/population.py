@@ -139,8 +139,8 @@ class _Posterior:
 
     mean: Vector  # mu
     mean_covariance: Square  # W
-    own: Float[np.ndarray, "k p"]  # their logs together
-    own_covariances: Float[np.ndarray, "k p p"]  # V
+    pooled: Float[np.ndarray, "k p"]  # their logs together
+    pooled_covariances: Float[np.ndarray, "k p p"]  # V
     shrinkage: Float[np.ndarray, "k p p"]  # B
     values: Float[np.ndarray, "k p"]
     covariances: Float[np.ndarray, "k p p"]
@@ -209,7 +209,7 @@ def estimate_population(
     columns: dict[str, Any] = {"actuator": labels, "logs": logs.add_up(np.ones(len(rows), dtype=int))}
     for k, name in enumerate(names):
         shrunk = posterior.values[:, k] * scale[k] + offset[k], np.sqrt(covariances[:, k, k]) * scale[k]
-        alone = posterior.own[:, k] * scale[k] + offset[k], np.sqrt(posterior.own_covariances[:, k, k]) * scale[k]
+        alone = posterior.pooled[:, k] * scale[k] + offset[k], np.sqrt(posterior.pooled_covariances[:, k, k]) * scale[k]
         parts = (*_restore(*shrunk, logarithmic[k]), *_restore(*alone, logarithmic[k])[:2])
         columns |= dict(zip((f"{name}{part}" for part in PARTS), parts, strict=True))
     outer = np.outer(scale, scale)
@@ -271,21 +271,21 @@ def _thin(logs: _Logs) -> _Logs:
 def _infer(logs: _Logs, between: Square, within: Square) -> _Posterior:
     """Return what is known of the actuators, given T and R."""
     weights = np.linalg.inv(logs.covariances + within)
-    own_covariances = _mirror(np.linalg.inv(logs.add_up(weights)))
-    own = _times(own_covariances, logs.add_up(_times(weights, logs.values)))
-    precisions = np.linalg.inv(own_covariances + between)
+    pooled_covariances = _mirror(np.linalg.inv(logs.add_up(weights)))
+    pooled = _times(pooled_covariances, logs.add_up(_times(weights, logs.values)))
+    precisions = np.linalg.inv(pooled_covariances + between)
     mean_covariance = np.linalg.inv(precisions.sum(axis=0))
-    mean = mean_covariance @ _times(precisions, own).sum(axis=0)
+    mean = mean_covariance @ _times(precisions, pooled).sum(axis=0)
     shrinkage = between @ precisions
     remaining = np.eye(len(mean)) - shrinkage
     covariances = between - shrinkage @ between + remaining @ mean_covariance @ remaining.mT
     return _Posterior(
         mean=mean,
         mean_covariance=mean_covariance,
-        own=own,
-        own_covariances=own_covariances,
+        pooled=pooled,
+        pooled_covariances=pooled_covariances,
         shrinkage=shrinkage,
-        values=mean + _times(shrinkage, own - mean),
+        values=mean + _times(shrinkage, pooled - mean),
         covariances=_mirror(covariances),
     )
 
@@ -325,12 +325,12 @@ def _propagate_sampling(posterior: _Posterior, between: Square, count: int) -> F
     derivatives = np.zeros((len(entries), size, size))
     for row, (i, j) in enumerate(entries):
         derivatives[row, i, j] = derivatives[row, j, i] = 1.0
-    precisions = np.linalg.inv(posterior.own_covariances + between)
+    precisions = np.linalg.inv(posterior.pooled_covariances + between)
     turned = precisions[:, None] @ derivatives  # k entries p p
     information = 0.5 * np.einsum("kaij,kbji->ab", turned, turned) * (count / len(precisions))
     sampling = np.linalg.inv(information)
     remaining = np.eye(size) - posterior.shrinkage
-    slopes = np.einsum("kij,ajl,kl->kia", remaining, derivatives, _times(precisions, posterior.own - posterior.mean))
+    slopes = np.einsum("kij,ajl,kl->kia", remaining, derivatives, _times(precisions, posterior.pooled - posterior.mean))
     return slopes @ sampling @ slopes.mT
 
 

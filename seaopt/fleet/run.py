@@ -114,12 +114,12 @@ def fit_fleet(
             raise LogError(f'identity has a column "{name}", which the table has for something else; rename it')
     with ExitStack() as stack:
         if folder is None:
-            place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="seaopt-fleet-")))
+            root = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="seaopt-fleet-")))
         else:
-            place = Path(folder)
-            check_folder(place)
-            check_name(place, "a fleet's tables cannot lie there; give another folder: -o out")
-        table = FleetTable(place, schema, plan)
+            root = Path(folder)
+            check_folder(root)
+            check_name(root, "a fleet's tables cannot lie there; give another folder: -o out")
+        table = FleetTable(root, schema, plan)
         stack.callback(table.close)
         if executor is None:
             executor = Processes()
@@ -141,7 +141,7 @@ def fit_fleet(
         if folder is not None:
             summary = result.to_dict() | {"problem_sha256": plan.digest, "version": plan.version}
             summary["other_logs"] = content.filter(~named)["log"].to_list()
-            write_json(place / "fleet.json", _keep_summary(place / "fleet.json", summary, result) | summary)
+            write_json(root / "fleet.json", _keep_summary(root / "fleet.json", summary, result) | summary)
     return result
 
 
@@ -169,12 +169,12 @@ def read_fleet(folder: Path | str) -> Fleet:
     Traceback (most recent call last):
     seaopt.errors.FileError: no_such_folder/fleet.json: ...
     """
-    place, remedy = Path(folder), "type the command of the fleet again"
-    content = read_json(place / "fleet.json", FLEET_SCHEMA, remedy=remedy)
+    root, remedy = Path(folder), "type the command of the fleet again"
+    content = read_json(root / "fleet.json", FLEET_SCHEMA, remedy=remedy)
     missing = [name for name in ("fitted", "free", "other_logs") if name not in content]
     if missing:
-        raise FileError(f"{place / 'fleet.json'}: has no {missing[0]}, as of an older seaopt; {remedy}")
-    rows = read_rows(place).filter(~pl.col("log").is_in(content["other_logs"]))
+        raise FileError(f"{root / 'fleet.json'}: has no {missing[0]}, as of an older seaopt; {remedy}")
+    rows = read_rows(root).filter(~pl.col("log").is_in(content["other_logs"]))
     fleet = Fleet(
         rows=rows,
         units=content["units"],
@@ -186,7 +186,7 @@ def read_fleet(folder: Path | str) -> Fleet:
         population=content.get("population"),
     )
     if fleet.counts != content["counts"]:
-        raise FileError(f"{place}: its table has changed since fleet.json, as where a run was stopped; {remedy}")
+        raise FileError(f"{root}: its table has changed since fleet.json, as where a run was stopped; {remedy}")
     return fleet
 
 

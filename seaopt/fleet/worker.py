@@ -48,9 +48,9 @@ def name_process() -> str:
     return f"{socket.gethostname()}:{os.getpid()}"
 
 
-def fit_batch(plan: Plan, logs: Sequence[FleetLog], known: Mapping[str, str]) -> list[Row]:
-    """Return a row for each log; one whose contents are those in `known` is "unchanged" and not fitted again."""
-    return [_fit_log(plan, log, known.get(log.path)) for log in logs]
+def fit_batch(plan: Plan, logs: Sequence[FleetLog], digests: Mapping[str, str]) -> list[Row]:
+    """Return a row for each log; one whose contents are those in `digests` is "unchanged" and not fitted again."""
+    return [_fit_log(plan, log, digests.get(log.path)) for log in logs]
 
 
 @lru_cache(maxsize=4)
@@ -58,7 +58,7 @@ def _load(plan: Plan) -> Problem:
     return plan.make_problem()
 
 
-def _fit_log(plan: Plan, log: FleetLog, known: str | None) -> Row:
+def _fit_log(plan: Plan, log: FleetLog, stored_digest: str | None) -> Row:
     """Return a log's row."""
     started = time.perf_counter()
     row: Row = {"log": log.path, **log.identity}
@@ -69,7 +69,7 @@ def _fit_log(plan: Plan, log: FleetLog, known: str | None) -> Row:
             return row | {"status": FAILED, "reason": reason, "total_s": 0.0}
         _load(plan)  # once, and not in the log's time
         with _limit_time(plan):
-            row |= _describe_fit(plan, log, known)
+            row |= _describe_fit(plan, log, stored_digest)
     except SeaoptError as error:
         row |= {"status": FAILED, "reason": str(error)}
     except _TimeLimitError:
@@ -86,10 +86,10 @@ def describe_limit(plan: Plan) -> str:
     return f"takes longer than the time limit of {plan.time_limit_s:g} s; shorten it, or raise the limit"
 
 
-def _describe_fit(plan: Plan, log: FleetLog, known: str | None) -> Row:
+def _describe_fit(plan: Plan, log: FleetLog, stored_digest: str | None) -> Row:
     problem = _load(plan)
     with open_local(log.path) as (path, digest):
-        if digest == known:
+        if digest == stored_digest:
             return {"status": UNCHANGED}
         row: Row = {"log_sha256": digest}
         try:

@@ -169,8 +169,8 @@ def _steepest_wave(plant: Plant, reading: Reading, p: Any) -> Any:
     are.
     """
     friction, size = plant.friction[reading.friction], sum(getattr(p, name) ** 2 for name in reading.sizes)
-    held = 0.0 if friction.jump is None else friction.jump(0.0, friction.add_rated(p))
-    return getattr(p, reading.wave) * ca.fmax(ca.sqrt(size + LEAST_SIZE**2) - held, 0.0)
+    jump = 0.0 if friction.jump is None else friction.jump(0.0, friction.add_rated(p))
+    return getattr(p, reading.wave) * ca.fmax(ca.sqrt(size + LEAST_SIZE**2) - jump, 0.0)
 
 
 def _list_waves(plant: Plant, params: CompletedParameters) -> list[Reading]:

@@ -75,8 +75,10 @@ def catch(plant: Plant, params: CompletedParameters, state: State, port: Port) -
     return moved[[k for k, name in enumerate(names) if name not in (coordinate, rate)]], impulse, loss
 
 
-def release(plant: Plant, params: CompletedParameters, port: Port, held: HeldState, link: Mapping[str, float]) -> State:
-    """Return the state of a plant after the link at a port, `held` so far, is let go at the position `link`, such as
+def release(
+    plant: Plant, params: CompletedParameters, port: Port, caught: HeldState, link: Mapping[str, float]
+) -> State:
+    """Return the state of a plant after the link at a port, `caught` so far, is let go at the position `link`, such as
     {"phi": 0.3}; zero where left out, as its rate is: the reverse of `catch`. Raises PlantError: the port does not
     move, or `link` names no state of its link.
     """
@@ -86,7 +88,7 @@ def release(plant: Plant, params: CompletedParameters, port: Port, held: HeldSta
             raise PlantError(
                 f'link = {{"{name}": ...}} is not a state of the link of {plant.name}; {suggestion(name, link_states)}'
             )
-    remaining = iter(held)
+    remaining = iter(caught)
     after = np.array(
         [link.get(name, 0.0) if name in link_states else next(remaining) for name in plant.states], dtype=float
     )
@@ -102,20 +104,21 @@ def offset(plant: Plant, params: CompletedParameters, state: State, port: Port) 
     return out
 
 
-def check_held(plant: Plant, held: Plant) -> None:
+def check_held(plant: Plant, partner: Plant) -> None:
     """Refuse a plant that is not another with its first port held. It is compared with the one that the port makes;
     where the port makes none, only the names of the states tell. Raises PlantError: the states are not the same but for
     the link's.
     """
     port = plant.port
     if port is not None and port.held is not None:
-        same = _is_same(port.held(), held)
+        same = _is_same(port.held(), partner)
     else:
         link = (port.coordinate, port.rate) if port is not None else ()
-        same = bool(link) and list(held.states) == [name for name in plant.states if name not in link]
+        same = bool(link) and list(partner.states) == [name for name in plant.states if name not in link]
     if not same:
         raise PlantError(
-            f"{held.name} is not {plant.name} with a link fixed; give two plants with the same drive, spring and parts"
+            f"{partner.name} is not {plant.name} with a link fixed; give two plants with the same drive, spring and "
+            "parts"
         )
 
 

@@ -192,8 +192,8 @@ def _list_outputs(build: _Build) -> dict[str, tuple[str, Any]]:
 
 def _ports(name: str, build: _Build) -> tuple[Port, ...]:
     """Return the ports at link 2 and, where it moves, at link 1."""
-    held = replace(build, parts=tuple(part for part in build.parts if part in part_laws.INSIDE))
-    bare = replace(held, links=("fixed", "mass"), suffixes=("1", "2"), external=True)
+    inside = replace(build, parts=tuple(part for part in build.parts if part in part_laws.INSIDE))
+    bare = replace(inside, links=("fixed", "mass"), suffixes=("1", "2"), external=True)
     ports: list[Port] = []
     for number, ratio in ((2, 1.0), (1, -1.0)):  # the spring's compression is q + x_2 - x_1
         kind, suffix = build.links[number - 1], build.suffixes[number - 1]
@@ -210,7 +210,7 @@ def _ports(name: str, build: _Build) -> tuple[Port, ...]:
                 rate=link.rate,
                 effort=link.effort if build.external else None,
                 payload=(f"m_{number}",) if kind == "mass" else (f"I_p{suffix}", f"m{suffix}"),
-                held=partial(_actuator, f"{name}, link {number} held", replace(held, links=links)),
+                held=partial(_actuator, f"{name}, link {number} held", replace(inside, links=links)),
                 drive="q",
                 ratio=lambda p, ratio=ratio: ratio,
                 probe=probe,

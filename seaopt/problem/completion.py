@@ -122,9 +122,9 @@ def _surround_schedule(problem: Problem, schedule: ScheduledController, source: 
     """Return a schedule's controllers with the problem's outer loop."""
     values, outer = problem.values(source), problem.table.impedance
     link = problem.design_plant if outer is None else problem.plants[outer.plant]
-    place = partial(place_variable, link, values, schedule.over)
-    between = ((schedule.at(value), place(value)) for value in list_inner(schedule.points, PARTS))
-    return add_outer_loop(problem, list(zip(schedule.controllers, map(place, schedule.points), strict=True)), between)
+    stand = partial(place_variable, link, values, schedule.over)
+    between = ((schedule.at(value), stand(value)) for value in list_inner(schedule.points, PARTS))
+    return add_outer_loop(problem, list(zip(schedule.controllers, map(stand, schedule.points), strict=True)), between)
 
 
 def _join_gates(

@@ -341,9 +341,9 @@ def _check_held(plant: Plant) -> None:
     for number, port in enumerate(plant.ports, 1):
         if port.held is None:
             continue
-        held, left = port.held(), [name for name in plant.states if name not in (port.coordinate, port.rate)]
-        if list(held.states) != left or list(held.inputs)[:1] != list(plant.inputs)[:1]:
+        locked, left = port.held(), [name for name in plant.states if name not in (port.coordinate, port.rate)]
+        if list(locked.states) != left or list(locked.inputs)[:1] != list(plant.inputs)[:1]:
             raise PlantError(
-                f"ports.{number}.held: plant {held.name} has the states {', '.join(held.states) or 'none'}; with the "
-                f"link held they are {', '.join(left) or 'none'}, and the first input is the same"
+                f"ports.{number}.held: plant {locked.name} has the states {', '.join(locked.states) or 'none'}; with "
+                f"the link held they are {', '.join(left) or 'none'}, and the first input is the same"
             )

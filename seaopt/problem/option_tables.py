@@ -99,13 +99,13 @@ def _as_formula(takes: Any, returned: Any) -> Any:
     return dict[str, Formula] if get_origin(returned) is Mapping else Formula
 
 
-def make_record(record: type[Any], table: BaseModel, **others: Any) -> Any:
+def make_record(record: type[Any], table: BaseModel, **further: Any) -> Any:
     """Return a record with the options that a table states, and others that are given."""
     stated = {field.name: field for field in list_options(record) if field.name in type(table).model_fields}
     values = {
-        name: make_value(getattr(table, name), field.kind) for name, field in stated.items() if name not in others
+        name: make_value(getattr(table, name), field.kind) for name, field in stated.items() if name not in further
     }
-    return record(**values, **others)
+    return record(**values, **further)
 
 
 def make_value(value: Any, kind: Any) -> Any:

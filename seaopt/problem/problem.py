@@ -353,15 +353,15 @@ class Problem:
             return replace(made, min=low, max=made.max if stated.max is not None else max(default.max, made.value))
         if not isinstance(stated, ColumnTable):
             return stated
-        signal, place = log.signal(OWN + name), f"experiment {table.name}: parameters: {name}"
+        signal, where = log.signal(OWN + name), f"experiment {table.name}: parameters: {name}"
         if signal.unit and signal.unit != unit and not same_dimension(signal.unit, unit):
             raise ProblemError(
-                f'{place} is in {unit or "no unit"}, and column "{stated.column}" in {signal.unit}; correct the '
+                f'{where} is in {unit or "no unit"}, and column "{stated.column}" in {signal.unit}; correct the '
                 "column's unit"
             )
         value = float(np.median(signal.values))
         if not np.all(np.abs(signal.values - value) <= ROUNDED * abs(value)):
-            raise ProblemError(f'{place} is not one value throughout column "{stated.column}"; make it an input')
+            raise ProblemError(f'{where} is not one value throughout column "{stated.column}"; make it an input')
         return value
 
     def _read_log(self, table: ExperimentTable, *, anywhere: bool) -> Log:
@@ -380,14 +380,14 @@ class Problem:
             duplicates=table.duplicates,
         )
 
-    def _simulate_bench(self, plant: Plant, table: VirtualTable, own: Mapping[str, float]) -> Log:
+    def _simulate_bench(self, plant: Plant, table: VirtualTable, overrides: Mapping[str, float]) -> Log:
         kinds = {"chirp": Chirp, "noise": Noise, "multisine": Multisine}
         excitation: Excitation = tuple(
             make_record(kind, part)
             for name, kind in kinds.items()
             if (part := getattr(table.excitation, name)) is not None
         )
-        values, changed = plant.complete(self.parameters), {**own, **table.truth}
+        values, changed = plant.complete(self.parameters), {**overrides, **table.truth}
         for name in changed:
             if name not in values:
                 raise ProblemError(f'{self.source}: truth names "{name}"; {suggestion(name, values)}')

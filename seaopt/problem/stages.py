@@ -206,7 +206,7 @@ def tune_problem(
     if schedule is not None and not rounds:
 
         def make(
-            asked: ControllerSpec,
+            spec_now: ControllerSpec,
             witnesses: Mapping[str, tuple[Plant, ParameterSet]],
             near: ScheduledController | None,
             points: Sequence[float],
@@ -219,7 +219,7 @@ def tune_problem(
             options: dict[str, Any] = {"draws": draws, "witnesses": witnesses, "near": near, "outer": outer}
             options["progress"] = part
             tuned = tune_schedule(
-                problem.design_plant, values, asked, schedule.over, points, kept, bandwidths_hz=bands, **options
+                problem.design_plant, values, spec_now, schedule.over, points, kept, bandwidths_hz=bands, **options
             )
             return complete_schedule(problem, tuned, source)
 

@@ -114,60 +114,63 @@ class _Steps:
         """Return the state at the end, and its derivatives."""
         moved = self.thetas + 1 + 2 * self.u0.size
         z = np.column_stack([x, np.eye(x.size), np.zeros((x.size, moved))])
-        place, mode = 0.0, 0.0
+        elapsed, mode = 0.0, 0.0
         for phase in range(PHASES):
-            first = self._look(z, place)
+            first = self._look(z, elapsed)
             effect = float(first.by_x @ first.effect)
             if not phase:
                 still = abs(first.speed) <= STILL_S * abs(effect) * first.level
                 mode = first.choose_mode() if still else float(np.sign(first.speed))
             if mode == 0.0:
                 z = self._take_speed(z, first, first.effect / effect)
-            end = self._advance(z, place, 1.0, mode)
+            end = self._advance(z, elapsed, 1.0, mode)
             if not self.h > 0.0 or phase == PHASES - 1:
                 return _split(end)
             last = self._look(end, 1.0)
             if not (last.room < 0.0 if mode == 0.0 else mode * last.speed <= 0.0):
                 return _split(end)
             if mode == 0.0:
-                share = self._find_start(z, place, first.room, last.room)
+                share = self._find_start(z, elapsed, first.room, last.room)
             else:
-                length = mode * (1.0 - place) * self.h
+                length = mode * (1.0 - elapsed) * self.h
                 slopes = (
                     length * float(at.by_x @ self._rate(each, where, mode))
-                    for at, each, where in ((first, z, place), (last, end, 1.0))
+                    for at, each, where in ((first, z, elapsed), (last, end, 1.0))
                 )
                 before, after = slopes
                 share = find_turn(mode * first.speed, before, mode * last.speed, after)
-            z, place = self._advance(z, place, place + share * (1.0 - place), mode), place + share * (1.0 - place)
-            now = self._look(z, place)
+            z, elapsed = (
+                self._advance(z, elapsed, elapsed + share * (1.0 - elapsed), mode),
+                elapsed + share * (1.0 - elapsed),
+            )
+            now = self._look(z, elapsed)
             following = now.choose_mode() if mode else float(np.sign(now.holding))
             if mode * following < 0.0:
-                rates = self._rate(z, place, mode), self._rate(z, place, following)
+                rates = self._rate(z, elapsed, mode), self._rate(z, elapsed, following)
                 z = self._take_speed(z, now, (rates[0] - rates[1]) / float(now.by_x @ rates[0]))
             mode = following
         raise AssertionError  # the last phase returns
 
-    def _find_start(self, z: Any, place: float, below: float, above: float) -> float:
+    def _find_start(self, z: Any, elapsed: float, below: float, above: float) -> float:
         """Return the share of what is left of a step after which a joint that is held gives way."""
         low, high = 0.0, 1.0
         for _ in range(2):
             share = low + (high - low) * below / (below - above)
-            to = place + share * (1.0 - place)
-            room = self._look(self._advance(z, place, to, 0.0), to).room
+            to = elapsed + share * (1.0 - elapsed)
+            room = self._look(self._advance(z, elapsed, to, 0.0), to).room
             if room >= 0.0:
                 low, below = share, room
             else:
                 high, above = share, room
         return low + (high - low) * below / (below - above)
 
-    def _input(self, place: float) -> Vector:
-        return self.u0 + place * (self.u1 - self.u0)
+    def _input(self, elapsed: float) -> Vector:
+        return self.u0 + elapsed * (self.u1 - self.u0)
 
-    def _look(self, z: Any, place: float) -> _Joint:
+    def _look(self, z: Any, elapsed: float) -> _Joint:
         call = self.functions._joint
-        figures, *others = (each.ravel() for each in call(self.t + place * self.h, z[:, 0], self._input(place), self.p))
-        by_x, by_theta, effect = others
+        time = self.t + elapsed * self.h
+        figures, by_x, by_theta, effect = (each.ravel() for each in call(time, z[:, 0], self._input(elapsed), self.p))
         return _Joint(
             speed=float(figures[0]),
             holding=float(figures[1]),
@@ -177,8 +180,8 @@ class _Steps:
             effect=effect,
         )
 
-    def _rate(self, z: Any, place: float, mode: float) -> Vector:
-        (f,) = self.functions._rate(self.t + place * self.h, z[:, 0], self._input(place), self.p, mode)
+    def _rate(self, z: Any, elapsed: float, mode: float) -> Vector:
+        (f,) = self.functions._rate(self.t + elapsed * self.h, z[:, 0], self._input(elapsed), self.p, mode)
         return f.ravel()
 
     def _advance(self, z: Any, start: float, end: float, mode: float) -> Any:

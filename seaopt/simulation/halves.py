@@ -43,9 +43,9 @@ def find_run_up(sensitivity: MatrixNN, samples: int) -> int:
 
 def join_columns(z: Float[np.ndarray, "nx nj"], layout: Layout) -> MatrixNN:
     """Return T from the state and its derivatives at the end of the first half."""
-    known, nx = 1 + layout.shared, layout.nx
+    first, nx = 1 + layout.shared, layout.nx
     matrix = np.eye(layout.columns)
-    matrix[known : known + nx, 1 : known + nx] = z[:, 1 : known + nx]
+    matrix[first : first + nx, 1 : first + nx] = z[:, 1 : first + nx]
     return matrix
 
 

@@ -108,8 +108,8 @@ class Model:
     def __reduce__(self) -> tuple[Any, ...]:
         names = [str(symbol) for symbol in ca.vertsplit(self.p)]
         equations = ca.Function("model", [self.t, self.x, self.u, self.p], [self.f, self.h])
-        others = ("plant", "free", "outputs", "constants", "linear", "sticks")
-        return _restore_model, (names, equations, {name: getattr(self, name) for name in others})
+        plain = ("plant", "free", "outputs", "constants", "linear", "sticks")
+        return _restore_model, (names, equations, {name: getattr(self, name) for name in plain})
 
     def __copy__(self) -> Model:
         return self  # nothing of a model changes
@@ -208,12 +208,12 @@ def _choose_symbols(plant: Plant, names: Sequence[str]) -> tuple[Any, Any]:
     return u, ca.vertcat(ca.SX(0, 1), *(symbols[name] for name in names))
 
 
-def _restore_model(names: list[str], equations: Any, others: dict[str, Any]) -> Model:
+def _restore_model(names: list[str], equations: Any, plain: dict[str, Any]) -> Model:
     """Return a pickled model, in its plant's symbols."""
-    plant = others["plant"]
+    plant = plain["plant"]
     u, p = _choose_symbols(plant, names)
     f, h = equations(plant.t, plant.x, u, p)
-    return Model(u=u, p=p, f=f, h=h, **others)
+    return Model(u=u, p=p, f=f, h=h, **plain)
 
 
 def fill_parameters(model: Model, p: Any) -> Any:

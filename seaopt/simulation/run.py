@@ -195,21 +195,21 @@ def _run_kept(kept: _Kept, program: Program, x0: VectorX, *, output_rows: int, c
     return result
 
 
-def keep_part(asked: Asked, larger: Asked, columns: Sequence[int]) -> None:
+def keep_part(smaller: Asked, larger: Asked, columns: Sequence[int]) -> None:
     """Make the whole pass of a segment with more columns for whoever asks for it, and keep its part for who asks for
     these columns alone. Both are simulated alike, of the same plant and samples; there has to be room (`measure_room`).
     """
     kept = _kept.get()
     if kept is None:
         return
-    model, segment, *_ = asked
+    model, segment, *_ = smaller
     run_up = kept.find_run_up(segment)
     if run_up is not None:
         kept.keep_run_up(larger[1], run_up)
     whole = run_passes(*larger, outputs=True, columns=True, keep=True)
     if whole.columns is not None:
         rows = np.array(columns)
-        kept.add(_key(*asked), replace(whole, gram=whole.gram[:, rows[:, None], rows], chosen=rows), model, segment)
+        kept.add(_key(*smaller), replace(whole, gram=whole.gram[:, rows[:, None], rows], chosen=rows), model, segment)
 
 
 def _choose_columns(result: Pass, rows: slice) -> Any:

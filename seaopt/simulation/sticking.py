@@ -85,8 +85,8 @@ def sticking_line_step(plant: Plant) -> ca.Function:
     middle = runge_kutta_step(slide, 0.0, x, share)
 
     def hold(forces: Any) -> Any:
-        held = partial(slide, change=lambda sliding: ca.if_else(first, forces, sliding))
-        return runge_kutta_step(held, share, middle, 1.0 - share)
+        stopping = partial(slide, change=lambda sliding: ca.if_else(first, forces, sliding))
+        return runge_kutta_step(stopping, share, middle, 1.0 - share)
 
     levels = joints.levels(middle, find_input(share), p)
     free, pushed = hold(0.0 * levels), [hold(force) for force in _push_each(levels)]

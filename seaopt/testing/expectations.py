@@ -39,7 +39,7 @@ class Judgement:
 
     met: bool
     found: str
-    asked: str
+    expected: str
     remedy: str
 
 
@@ -75,7 +75,7 @@ class Expectation:
             return False, f"expect.{self.name}: there is no {self.stage}; {why}"
         outcome = self.judge(results)
         remedy = f"; {outcome.remedy}" if outcome.remedy and not outcome.met else ""
-        return outcome.met, f"expect.{self.name}: found {outcome.found}, asked for {outcome.asked}{remedy}"
+        return outcome.met, f"expect.{self.name}: found {outcome.found}, asked for {outcome.expected}{remedy}"
 
 
 def list_expectations(problem: Problem) -> list[Expectation]:
@@ -141,7 +141,7 @@ def _judge_met(stage: str, wanted: bool, results: Stages) -> Judgement:
     else:
         remedy = result.verdict if stage == "fit" else result.explanation
     words = {True: "yes", False: "no"}
-    return Judgement(met=result.met is wanted, found=words[result.met], asked=words[wanted], remedy=remedy)
+    return Judgement(met=result.met is wanted, found=words[result.met], expected=words[wanted], remedy=remedy)
 
 
 def _judge_parameter(parameter: str, limits: tuple[float, float] | RangeTable, results: Stages) -> Judgement:
@@ -154,7 +154,7 @@ def _judge_parameter(parameter: str, limits: tuple[float, float] | RangeTable, r
     estimate = {**results.fit.derived, **results.fit.parameters}.get(parameter)
     if estimate is None:
         remedy = "no experiment that is fitted has it"
-        return Judgement(met=False, found="nothing", asked=_format_ends(ends, unit or ""), remedy=remedy)
+        return Judgement(met=False, found="nothing", expected=_format_ends(ends, unit or ""), remedy=remedy)
     unit, scale = (estimate.unit, 1.0) if unit is None else (unit, factor(estimate.unit, unit))
     value, std = estimate.value * scale, None if estimate.total_std is None else estimate.total_std * scale
     identified = std is None or math.isfinite(std)
@@ -167,7 +167,7 @@ def _judge_parameter(parameter: str, limits: tuple[float, float] | RangeTable, r
     return Judgement(
         met=identified and _inside(value, ends),
         found=f"{value:.5g}" + ("" if std is None else f" ± {std:.2g}") + unit_after(unit),
-        asked=_format_ends(ends, unit),
+        expected=_format_ends(ends, unit),
         remedy=remedy,
     )
 
@@ -244,8 +244,8 @@ def _judge_figure(values: Mapping[str, Any], figure: str, ends: Ends, remedy: st
     assert isinstance(ends, tuple)  # every plant's band is to contain it
     return Judgement(
         met=bool(values) and all(band and all(_inside(end, band) for end in ends) for band in values.values()),
-        found=_format_places({place: format_band(band, "Hz") for place, band in values.items()}),
-        asked=f"one that contains {format_band(ends, 'Hz')}",
+        found=_format_places({at: format_band(band, "Hz") for at, band in values.items()}),
+        expected=f"one that contains {format_band(ends, 'Hz')}",
         remedy=remedy,
     )
 
@@ -256,8 +256,8 @@ def _judge_values(
     """Judge figures by plant, all of which are to be inside."""
     return Judgement(
         met=bool(values) and all(_inside(value, ends, tolerance) for value in values.values()),
-        found=_format_places({place: format_figure(value, unit, 5) for place, value in values.items()}),
-        asked=_format_ends(ends, unit),
+        found=_format_places({at: format_figure(value, unit, 5) for at, value in values.items()}),
+        expected=_format_ends(ends, unit),
         remedy=remedy,
     )
 
@@ -276,7 +276,7 @@ def _inside(value: float, ends: tuple[float, float], tolerance: float = LIMIT_RO
 
 def _format_places(figures: Mapping[str, str]) -> str:
     """Return figures as text, each with its place; one that has none is the only one."""
-    return ", ".join(f"{text} ({place})" if place else text for place, text in figures.items()) or "nothing"
+    return ", ".join(f"{text} ({at})" if at else text for at, text in figures.items()) or "nothing"
 
 
 def _format_ends(ends: tuple[float, float], unit: str) -> str:

@@ -596,5 +596,5 @@ def test_the_delay_of_an_output_is_that_of_its_samples():
     rng = np.random.default_rng(0)
     u = rng.normal(size=8000)
     y = np.concatenate([np.zeros(5), u[:-5]]) + 0.01 * rng.normal(size=8000)
-    delay_s, std = fit_delay(compute_spectra({"u": u, "y": y}, [slice(0, 8000)], 0.001), "u", "y", held=False)
+    delay_s, std = fit_delay(compute_spectra({"u": u, "y": y}, [slice(0, 8000)], 0.001), "u", "y", is_command=False)
     assert std < 1e-4 and delay_s == pytest.approx(0.005, abs=3 * std)

@@ -14,7 +14,7 @@ import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.formatting import format_count
-from seaopt.logs.formats.source import Field, Place, Source, check_size, make_row_loader, spread
+from seaopt.logs.formats.source import ArraySlice, Field, Source, check_size, make_row_loader, spread
 from seaopt.signals import TARGET_LOG
 
 HEADS = [("tick", "<u4"), ("lost", "<u2"), ("status", "<u2")]  # of a row of the target
@@ -26,7 +26,7 @@ RECORD_AGAIN = "record it again, draining whole rows from one context"
 
 def open_npz(path: Path) -> Source:
     """List the arrays of an NPZ archive."""
-    places: dict[str, Place] = {}
+    places: dict[str, ArraySlice] = {}
     fields: list[Field] = []
     with zipfile.ZipFile(path) as archive:
         members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
@@ -42,9 +42,9 @@ def open_npz(path: Path) -> Source:
                 continue
             if int(np.prod(shape, dtype=float)) * dtype.itemsize > member.file_size:
                 raise LogError(f"{path}: array {name} is cut off; save the archive again")
-            for field, place in spread(name, shape, dtype.name):
+            for field, array_slice in spread(name, shape, dtype.name):
                 fields.append(field)
-                places[field.name] = place
+                places[field.name] = array_slice
     return Source(path=path, format="NPZ", fields=tuple(fields), load=make_row_loader(partial(_load, path, places)))
 
 
@@ -56,13 +56,13 @@ def _read_header(stream: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return shape, dtype
 
 
-def _load(path: Path, places: dict[str, Place], name: str, rows: slice) -> Any:
-    place = places[name]
-    with zipfile.ZipFile(path) as archive, archive.open(f"{place.array}.npy") as stream:
+def _load(path: Path, places: dict[str, ArraySlice], name: str, rows: slice) -> Any:
+    array_slice = places[name]
+    with zipfile.ZipFile(path) as archive, archive.open(f"{array_slice.array}.npy") as stream:
         array = np.lib.format.read_array(stream, allow_pickle=False)
         if stream.read(1):  # to the end, where the checksum is looked at
-            raise LogError(f"{path}: array {place.array} is longer than it says; save the archive again")
-    return np.atleast_1d(array)[place.index_rows(rows)]
+            raise LogError(f"{path}: array {array_slice.array} is longer than it says; save the archive again")
+    return np.atleast_1d(array)[array_slice.index_rows(rows)]
 
 
 def open_target_log(path: Path) -> Source:
@@ -102,14 +102,14 @@ def open_target_log(path: Path) -> Source:
 def _read_rows(path: Path, layout: np.dtype[Any], first: int) -> tuple[Any, list[str]]:
     """Return the rows from a byte on, and what is to be said of them."""
     size = path.stat().st_size - first
-    count, rest = divmod(size, layout.itemsize)
+    count, surplus = divmod(size, layout.itemsize)
     if count < 1:
         raise LogError(f"{path}: has a header and no whole row of {layout.itemsize} bytes; drain the ring into it")
     check_size(path, size, "the log")
     rows = np.fromfile(path, dtype=layout, offset=first, count=count)
     notes = _check_rows(path, rows, first, layout.itemsize)
-    if rest:
-        notes.append(f"its last row is cut off and left out: {rest} of {layout.itemsize} bytes are there")
+    if surplus:
+        notes.append(f"its last row is cut off and left out: {surplus} of {layout.itemsize} bytes are there")
     return rows, notes
 
 

@@ -15,8 +15,8 @@ from seaopt.logs.formats.simulink import assign_clocks, make_object_field
 from seaopt.logs.formats.source import (
     MAX_DEPTH,
     MAX_FIELDS,
+    ArraySlice,
     Field,
-    Place,
     Source,
     check_size,
     import_optional,
@@ -71,7 +71,7 @@ def _check_length(path: Path) -> None:
         )
 
 
-Location = tuple[Place, str | None]  # with the column of a table
+Location = tuple[ArraySlice, str | None]  # with the column of a table
 Fields = Iterator[tuple[Field, Location]]
 
 
@@ -93,17 +93,17 @@ def _walk_datasets(file: Any, path: Path, prefix: str = "", depth: int = 0) -> F
 
 def _list_dataset(node: Any, name: str) -> Fields:
     if node.external or node.is_virtual:
-        yield Field(name=name, kind="data in another file", length=None), (Place(array=node.name), None)
+        yield Field(name=name, kind="data in another file", length=None), (ArraySlice(array=node.name), None)
         return
     dtype = node.dtype
     if dtype.names:  # a table: one field per column
         for part in dtype.names:
             kind = dtype[part].name if not dtype[part].shape else f"array {dtype[part]}"
-            yield Field(name=f"{name}.{part}", kind=kind, length=node.size), (Place(array=node.name), part)
+            yield Field(name=f"{name}.{part}", kind=kind, length=node.size), (ArraySlice(array=node.name), part)
         return
     unit = next((_decode_text(node.attrs[key]) for key in _UNIT_ATTRIBUTES if key in node.attrs), None)
-    for field, place in spread(name, node.shape or (), _name_kind(node), unit=unit):
-        yield field, (replace(place, array=node.name), None)
+    for field, array_slice in spread(name, node.shape or (), _name_kind(node), unit=unit):
+        yield field, (replace(array_slice, array=node.name), None)
 
 
 def _name_kind(node: Any) -> str:
@@ -155,11 +155,11 @@ def _walk_variable(file: Any, node: Any, path: Path, name: str, depth: int) -> F
     if "MATLAB_object_decode" in node.attrs or h5py.check_ref_dtype(node.dtype) or kind in {"char", "cell"}:
         word = {"char": "text", "cell": "a cell array"}.get(kind)
         field = Field(name=name, kind=word, length=None) if word else make_object_field(name, kind)
-        yield field, (Place(array=node.name), None)
+        yield field, (ArraySlice(array=node.name), None)
         return
     shape = tuple(reversed(node.shape or ()))
-    for field, place in spread(name, shape, _name_kind(node), matlab=True):
-        yield field, (replace(place, array=node.name, axis=1 - place.axis), None)
+    for field, array_slice in spread(name, shape, _name_kind(node), matlab=True):
+        yield field, (replace(array_slice, array=node.name, axis=1 - array_slice.axis), None)
 
 
 def _is_struct_array(node: Any) -> bool:
@@ -173,10 +173,10 @@ def _is_struct_array(node: Any) -> bool:
 def _load(path: Path, location: Location, rows: slice) -> Any:
     import h5py
 
-    place, part = location
+    array_slice, part = location
     with h5py.File(path, "r") as file:
-        node: Any = file[place.array]
-        name = place.array.removeprefix("/")
+        node: Any = file[array_slice.array]
+        name = array_slice.array.removeprefix("/")
         check_size(path, int(node.size) * 8, f'"{name}"')
         # Chunks that no filter packs take as much as their numbers do.
         if node.chunks is not None and not node.id.get_create_plist().get_nfilters():
@@ -187,4 +187,6 @@ def _load(path: Path, location: Location, rows: slice) -> Any:
                 )
         if node.shape == ():
             return node[()]
-        return node.fields(part)[place.index_rows(rows)] if part is not None else node[place.index_rows(rows)]
+        return (
+            node.fields(part)[array_slice.index_rows(rows)] if part is not None else node[array_slice.index_rows(rows)]
+        )

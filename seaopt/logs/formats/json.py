@@ -58,10 +58,10 @@ def open_json(path: Path) -> Source:
 def _load(path: Path, names: Sequence[str], _: Window | None) -> dict[str, VectorN]:
     columns: dict[str, list[float]] = {name: [] for name in names}
     with closing(_read_entries(path)[1]) as entries:
-        for place, entry in entries:
+        for where, entry in entries:
             row = dict(flatten(entry))
             for name, values in columns.items():
-                values.append(_to_number(path, place, name, row.get(name)))
+                values.append(_to_number(path, where, name, row.get(name)))
     return {name: np.array(values) for name, values in columns.items()}
 
 
@@ -70,13 +70,13 @@ def name_kind(value: Any) -> str:
     return "bool" if isinstance(value, bool) else "float64" if isinstance(value, int | float) else "text"
 
 
-def _to_number(path: Path, place: str, name: str, value: Any) -> float:
+def _to_number(path: Path, where: str, name: str, value: Any) -> float:
     if value is None:
         return float("nan")
     if not isinstance(value, int | float):
-        raise LogError(f'{path}: {place}: {json.dumps(value)[:60]} in "{name}" is not a number; correct it')
+        raise LogError(f'{path}: {where}: {json.dumps(value)[:60]} in "{name}" is not a number; correct it')
     if abs(value) > LARGEST:
-        raise LogError(f'{path}: {place}: "{name}" is not finite; write null')
+        raise LogError(f'{path}: {where}: "{name}" is not finite; write null')
     return float(value)
 
 
@@ -163,10 +163,10 @@ def _check_unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return entry
 
 
-def _check_object(path: Path, entry: Any, place: str) -> tuple[str, JsonEntry]:
+def _check_object(path: Path, entry: Any, where: str) -> tuple[str, JsonEntry]:
     if not isinstance(entry, dict):
-        raise LogError(f"{path}: {place} is not an object but {json.dumps(entry)[:40]}; write one with named values")
-    return place, entry
+        raise LogError(f"{path}: {where} is not an object but {json.dumps(entry)[:40]}; write one with named values")
+    return where, entry
 
 
 def flatten(record: JsonEntry, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:

@@ -21,7 +21,7 @@ from jaxtyping import Shaped
 
 from seaopt.errors import LogError
 from seaopt.logs.formats.simulink import OBJECT, assign_clocks, make_object_field
-from seaopt.logs.formats.source import MAX_DEPTH, Field, Place, Source, check_size, open_columns, spread
+from seaopt.logs.formats.source import MAX_DEPTH, ArraySlice, Field, Source, check_size, open_columns, spread
 from seaopt.records import record
 
 HEADER_BYTES = 128
@@ -67,7 +67,7 @@ class MatrixHeader:
         return "complex" if self.flags & COMPLEX else "bool" if self.flags & LOGICAL else NUMBER_CLASSES[self.kind]
 
 
-MatrixPlace = tuple[StoredVariable, MatrixHeader, Place]
+MatrixPlace = tuple[StoredVariable, MatrixHeader, ArraySlice]
 
 
 def open_mat(path: Path) -> Source:
@@ -86,16 +86,16 @@ def _walk_columns(path: Path) -> Iterator[tuple[Field, MatrixPlace]]:
             if leaf.kind in NUMBER_CLASSES:
                 columns = spread(leaf.name, leaf.dims, leaf.word, matlab=True)
             elif leaf.kind == OPAQUE:
-                columns = [(make_object_field(leaf.name, leaf.owner), Place(array=leaf.name))]
+                columns = [(make_object_field(leaf.name, leaf.owner), ArraySlice(array=leaf.name))]
             else:
-                columns = [(Field(name=leaf.name, kind=leaf.word, length=None), Place(array=leaf.name))]
-            for field, place in columns:
-                yield field, (variable, leaf, place)
+                columns = [(Field(name=leaf.name, kind=leaf.word, length=None), ArraySlice(array=leaf.name))]
+            for field, array_slice in columns:
+                yield field, (variable, leaf, array_slice)
 
 
 def _load(path: Path, location: MatrixPlace, rows: slice) -> Any:
-    variable, leaf, place = location
-    return _read_numbers(_read_body(path, variable), leaf, variable.order)[place.index_rows(rows)]
+    variable, leaf, array_slice = location
+    return _read_numbers(_read_body(path, variable), leaf, variable.order)[array_slice.index_rows(rows)]
 
 
 def _walk_variables(path: Path) -> Iterator[tuple[StoredVariable, bytes]]:

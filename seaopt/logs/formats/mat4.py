@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from seaopt.errors import LogError
-from seaopt.logs.formats.source import Field, Place, Source, open_columns, spread
+from seaopt.logs.formats.source import ArraySlice, Field, Source, open_columns, spread
 from seaopt.records import record
 
 HEADER = 20  # bytes
@@ -52,7 +52,7 @@ def open_mat4(path: Path) -> Source:
     return open_columns(path, "MAT 4", _walk_columns(path), partial(_load, path))
 
 
-def _walk_columns(path: Path) -> Iterator[tuple[Field, tuple[Matrix, Place]]]:
+def _walk_columns(path: Path) -> Iterator[tuple[Field, tuple[Matrix, ArraySlice]]]:
     size, at = path.stat().st_size, 0
     with path.open("rb") as stream:
         while at < size:
@@ -61,20 +61,20 @@ def _walk_columns(path: Path) -> Iterator[tuple[Field, tuple[Matrix, Place]]]:
             if matrix.end > size:
                 raise LogError(f"{path}: is cut off after {size} bytes; copy or save the file again")
             if matrix.kind in KINDS:
-                for field, place in spread(matrix.name, matrix.shape, matrix.kind, matlab=True):
-                    yield field, (matrix, place)
+                for field, array_slice in spread(matrix.name, matrix.shape, matrix.kind, matlab=True):
+                    yield field, (matrix, array_slice)
             else:
-                yield Field(name=matrix.name, kind=matrix.kind, length=None), (matrix, Place(array=matrix.name))
+                yield Field(name=matrix.name, kind=matrix.kind, length=None), (matrix, ArraySlice(array=matrix.name))
             at = matrix.end
 
 
-def _load(path: Path, location: tuple[Matrix, Place], rows: slice) -> Any:
-    matrix, place = location
+def _load(path: Path, location: tuple[Matrix, ArraySlice], rows: slice) -> Any:
+    matrix, array_slice = location
     count = matrix.shape[0] * matrix.shape[1]
     numbers = np.fromfile(path, matrix.stored, count=count, offset=matrix.start)
     if numbers.size < count:
         raise LogError(f"{path}: variable {matrix.name} is cut off; copy or save the file again")
-    return numbers.reshape(matrix.shape, order="F")[place.index_rows(rows)]
+    return numbers.reshape(matrix.shape, order="F")[array_slice.index_rows(rows)]
 
 
 def _read_header(head: bytes, at: int) -> Matrix:

@@ -149,7 +149,7 @@ def find_rows(clock: VectorN, window: Window) -> slice:
 
 
 @record
-class Place:
+class ArraySlice:
     """Where a field's samples are: an array, and one row or column of it (all of it where `index` is None)."""
 
     array: str
@@ -165,25 +165,27 @@ class Place:
 
 def spread(
     name: str, shape: Sequence[int], kind: str, *, matlab: bool = False, unit: str | None = None
-) -> list[tuple[Field, Place]]:
+) -> list[tuple[Field, ArraySlice]]:
     """Return the fields of an array: a vector is one, a matrix one per column (or row, if it has fewer of them)."""
     sizes = [int(size) for size in shape]
     long = [size for size in sizes if size != 1]
     if len(long) <= 1 and len(sizes) <= 2:
         length = long[0] if long else 1
         axis = 0 if len(sizes) == 2 and sizes[0] == 1 else 1
-        place = Place(array=name) if len(sizes) < 2 else Place(array=name, index=0, axis=axis)
-        return [(Field(name=name, kind=kind, length=length, unit=unit), place)]
+        array_slice = ArraySlice(array=name) if len(sizes) < 2 else ArraySlice(array=name, index=0, axis=axis)
+        return [(Field(name=name, kind=kind, length=length, unit=unit), array_slice)]
     if len(sizes) != 2 or min(sizes) > MAX_PARTS:
-        return [(Field(name=name, kind=f"{kind} array of {'x'.join(map(str, sizes))}", length=None), Place(array=name))]
+        return [
+            (Field(name=name, kind=f"{kind} array of {'x'.join(map(str, sizes))}", length=None), ArraySlice(array=name))
+        ]
     axis = 1 if sizes[1] <= sizes[0] else 0
     brackets = "({})" if matlab else "[{}]"
-    parts: list[tuple[Field, Place]] = []
+    parts: list[tuple[Field, ArraySlice]] = []
     for index in range(sizes[axis]):
         number = str(index + 1 if matlab else index)
         label = name + brackets.format(f":,{number}" if axis == 1 else f"{number},:")
-        place = Place(array=name, index=index, axis=axis)
-        parts.append((Field(name=label, kind=kind, length=sizes[1 - axis], unit=unit), place))
+        array_slice = ArraySlice(array=name, index=index, axis=axis)
+        parts.append((Field(name=label, kind=kind, length=sizes[1 - axis], unit=unit), array_slice))
     return parts
 
 

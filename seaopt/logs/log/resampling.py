@@ -93,7 +93,7 @@ def resample(
         for name, parts in new_values.items():
             values = log.signals[name].values[segment]
             if name in steps or not isinstance(chosen, Readings):
-                values = fill_holes(time[segment], values, hole_s, held=name in steps)
+                values = fill_holes(time[segment], values, hole_s, is_step=name in steps)
             if name in steps:
                 parts.append(_average_steps(grid, time[segment], values, period, rate_hz))
             else:
@@ -109,7 +109,7 @@ def resample(
     return np.concatenate(new_time), {name: np.concatenate(parts) for name, parts in new_values.items()}, note
 
 
-def fill_holes(time: VectorN, values: VectorN, longest_s: float, *, held: bool = False) -> VectorN:
+def fill_holes(time: VectorN, values: VectorN, longest_s: float, *, is_step: bool = False) -> VectorN:
     """Return a channel whose missing samples are on the line between those beside them, or are the one before them of a
     channel that is held, where these are at most so far apart; at an end they are what is next to them. Devices that
     write at times of their own leave such holes.
@@ -121,7 +121,7 @@ def fill_holes(time: VectorN, values: VectorN, longest_s: float, *, held: bool =
     late = time[present[np.minimum(after, present.size - 1)]]
     early = time[present[np.maximum(after - 1, 0)]]
     apart = np.maximum(late - time, 0.0) + np.maximum(time - early, 0.0)
-    line = values[present[np.maximum(after - 1, 0)]] if held else np.interp(time, time[present], values[present])
+    line = values[present[np.maximum(after - 1, 0)]] if is_step else np.interp(time, time[present], values[present])
     return np.where(np.isnan(values) & (apart <= longest_s), line, values)
 
 

@@ -65,9 +65,9 @@ class Rail:
 
 @record(eq=False)
 class CounterLosses:
-    """A channel that counts: each value held `held` samples, `lost` samples skipped ahead of each of `rows`."""
+    """A channel that counts: `samples_per_count` alike as a rule, `lost` samples skipped ahead of each of `rows`."""
 
-    held: int
+    samples_per_count: int
     rows: RowsK
     lost: RowsK
 
@@ -239,4 +239,4 @@ def find_counter_losses(values: VectorN) -> CounterLosses | None:
     # A value that was held too briefly lost samples; so did every value that was passed over.
     lost = np.maximum(usual - spacing, 0) + ((turned[1:] - 1.0) * usual).astype(int)
     short = lost > 0
-    return CounterLosses(held=usual, rows=changes[1:][short], lost=lost[short])
+    return CounterLosses(samples_per_count=usual, rows=changes[1:][short], lost=lost[short])

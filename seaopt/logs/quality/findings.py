@@ -178,7 +178,9 @@ def find_channel_faults(channel: ChannelQuality, time: VectorN, *, may_drive: bo
     losses = channel.counter
     if losses is not None and losses.rows.size:
         total = int(np.sum(losses.lost))
-        counter = {"column": name} | ({"samples_per_count": losses.held} if losses.held > 1 else {})
+        counter = {"column": name} | (
+            {"samples_per_count": losses.samples_per_count} if losses.samples_per_count > 1 else {}
+        )
         spelt = ", ".join(f"{key}={json.dumps(value, ensure_ascii=False)}" for key, value in counter.items())
         text = (
             f"{name} counts, and skips at {format_count(losses.rows.size, 'place')}: {format_count(total, 'sample')} "

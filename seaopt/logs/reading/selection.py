@@ -227,9 +227,9 @@ def _match_fields(source: Source, column: str | int) -> list[Field]:
     return [field for number, field in numbered if number == column]
 
 
-def _explain_missing(places: Sequence[Source], name: str, asked: Column) -> str:
+def _explain_missing(places: Sequence[Source], name: str, wanted: Column) -> str:
     """Return what to do about a column that is not there, or about a header that several columns have."""
-    column = asked.column
+    column = wanted.column
     fields = [field for source in places for field in source.fields]
     if isinstance(column, int):
         return f"no column {column} for {name}; the file has {len(fields)}: {_list_names([f.name for f in fields])}"
@@ -241,7 +241,7 @@ def _explain_missing(places: Sequence[Source], name: str, asked: Column) -> str:
     names = [field.name for field in fields]
     near = get_close_matches(column, names, n=1, cutoff=0.6)
     listed = f"seaopt inspect {shlex.quote(str(places[0].path))} --list"
-    key = name if asked == Column(column=column) else "column"  # its unit and scale stay
+    key = name if wanted == Column(column=column) else "column"  # its unit and scale stay
     how = f' write {key} = "{near[0]}"' if near else f"; list them: {listed}"
     return f'no column "{column}" for {name}; {suggest_names(column, names)}{how}'
 

@@ -133,8 +133,8 @@ def is_m_open(header: Header) -> bool:
 def find_unit_in_name(name: str) -> str | None:
     """Return the unit that a name ends in, as i_cmd_A or time_s; None where it ends in none, or in what may be none."""
     header = read_header(name)
-    known = is_unit(header.unit) and not is_count(header.unit) and not is_m_open(header)
-    return header.unit if header.unit and known else None
+    is_sure = is_unit(header.unit) and not is_count(header.unit) and not is_m_open(header)
+    return header.unit if header.unit and is_sure else None
 
 
 def is_count(unit: str) -> bool:

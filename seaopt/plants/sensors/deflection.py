@@ -91,8 +91,8 @@ def find_scale(plant: Plant, params: CompletedParameters, output: str) -> float 
     rows = [names.index(name) for name in (output, sensing.regulated[0])]
     slopes = ca.densify(ca.jacobian(plant.output, plant.x[motor])[rows])
     at_rest = ca.Function("slopes", plant.symbols, [slopes])
-    read, own = at_rest(0.0, 0.0, 0.0, params.vector).full().ravel().tolist()
-    return read / own if read and own else None
+    reading, deflection = at_rest(0.0, 0.0, 0.0, params.vector).full().ravel().tolist()
+    return reading / deflection if reading and deflection else None
 
 
 def keep_weights(plant: Plant) -> Sensing | None:

@@ -259,8 +259,8 @@ def _describe_log(
     if table is None:
         return log
     positions = [name for name in log.outputs if name in POSITIONS]
-    held = not roles.columns[roles.input].header.measured
-    return replace(log, traits=find_traits(table, roles.input, log.outputs, positions, held=held))
+    is_command = not roles.columns[roles.input].header.measured
+    return replace(log, traits=find_traits(table, roles.input, log.outputs, positions, is_command=is_command))
 
 
 def _list_notes(log: DescribedLog) -> Iterator[str]:
@@ -359,11 +359,11 @@ def _ask_link(log: DescribedLog, interview: Interview) -> str:
     roles, key = log.roles, f"link:{log.survey.name}"
     if not roles.rotary:
         return "swing" if "phi" in roles.columns else "held"
-    held, why = is_held(roles, log.si_scale("theta_l"), log.si_scale("theta_m"))
+    is_locked, why = is_held(roles, log.si_scale("theta_l"), log.si_scale("theta_m"))
     return interview.ask(
         key,
         f"In {log.survey.name}, is the link held, free, or hanging (gravity pulls it back)?",
-        "held" if held else "free",
+        "held" if is_locked else "free",
         why,
         ("held", "free", "hanging"),
     )

@@ -111,8 +111,8 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
     r"""Read every column of a log. `clock` names the time where the file leaves that open, `units` are those of columns
     whose headers have none, or a wrong one. Raises LogError: the file cannot be read, or holds no numbers that vary.
     """
-    held = contents(path)
-    numeric = {field.name: field for field in held.fields if field.numeric}
+    listing = contents(path)
+    numeric = {field.name: field for field in listing.fields if field.numeric}
     if not numeric:
         command = f"seaopt inspect {shlex.quote(str(path))} --list"
         raise LogError(f"{path}: holds no column of numbers; list what it holds with {command}")
@@ -154,7 +154,7 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
         for name, column in columns.items()
         if column.swing == 0.0 and name != chosen
     }
-    words = {field.name: "text" for field in held.fields if not field.numeric}
+    words = {field.name: "text" for field in listing.fields if not field.numeric}
     return LogSurvey(
         path=path,
         clock=columns[chosen] if chosen is not None else None,

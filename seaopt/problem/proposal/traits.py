@@ -37,26 +37,28 @@ class Traits:
     unexcited: InputExcitation | None = None  # of an input that no output follows linearly
 
 
-def find_traits(table: Table, source: str, outputs: Sequence[str], positions: Sequence[str], *, held: bool) -> Traits:
-    """Return the traits of a log. `outputs`: what is fitted. `positions`: which of it are positions. `held`: whether
-    the input holds each value until the next sample; a measured one does not.
+def find_traits(
+    table: Table, source: str, outputs: Sequence[str], positions: Sequence[str], *, is_command: bool
+) -> Traits:
+    """Return the traits of a log. `outputs`: what is fitted. `positions`: which of it are positions. `is_command`:
+    whether the input holds each value until the next sample; a measured one does not.
     """
     quality = assess_quality(table, inputs=[source])
     excitation = quality.excitation.get(source)
     return Traits(
-        delay_s=_find_delay(quality, source, outputs, held=held),
+        delay_s=_find_delay(quality, source, outputs, is_command=is_command),
         outliers=sum(quality.channels[name].outliers.size for name in outputs),
         standing=tuple(name for name in positions if len(quality.channels[name].stuck) > 1),
         unexcited=excitation if excitation is not None and excitation.usable_hz is None else None,
     )
 
 
-def _find_delay(quality: Quality, source: str, outputs: Sequence[str], *, held: bool) -> float | None:
+def _find_delay(quality: Quality, source: str, outputs: Sequence[str], *, is_command: bool) -> float | None:
     """Return the delay of the output that tells it best; None where none tells one."""
     spectra = quality.spectra
     if spectra is None or source not in spectra.channels:
         return None
-    delays = [fit_delay(spectra, source, name, held=held) for name in outputs if name in spectra.channels]
+    delays = [fit_delay(spectra, source, name, is_command=is_command) for name in outputs if name in spectra.channels]
     sure = [(std, delay) for delay, std in filter(None, delays)]
     if not sure:
         return None
@@ -64,7 +66,7 @@ def _find_delay(quality: Quality, source: str, outputs: Sequence[str], *, held: 
     return delay if delay > max(LEAST_PERIODS * spectra.period, SURE * std) else None
 
 
-def fit_delay(spectra: Spectra, source: str, output: str, *, held: bool) -> tuple[float, float] | None:
+def fit_delay(spectra: Spectra, source: str, output: str, *, is_command: bool) -> tuple[float, float] | None:
     """Return the delay of an output and its standard deviation, s; None where too little is coherent."""
     f, coherence = spectra.frequency_hz[1:-1], spectra.coherence(source, output)[1:-1]
     good = np.flatnonzero(coherence > COHERENT)
@@ -85,4 +87,4 @@ def fit_delay(spectra: Spectra, source: str, output: str, *, held: bool) -> tupl
         return None
     scale = max(1.0, float(left[0]) / (rows.size - 3) if left.size else 1.0)
     std = float(np.sqrt(2.0 * scale * np.linalg.inv(matrix.T @ matrix)[2, 2]))
-    return float(solution[2]) - 0.5 * spectra.period * held, std
+    return float(solution[2]) - 0.5 * spectra.period * is_command, std

@@ -155,8 +155,8 @@ def place_legend(axis: Axes, draw: Callable[..., Legend]) -> None:
         places.append((int(hidden[row, column]), columns, (x / axis.bbox.width, y / axis.bbox.height)))
         if not places[-1][0]:  # nothing is hidden: more columns cannot be better
             break
-    _, columns, place = min(places, default=(0, 1, "best"))
-    draw(ncols=columns, loc=place)
+    _, columns, loc = min(places, default=(0, 1, "best"))
+    draw(ncols=columns, loc=loc)
 
 
 def _find_curves(axis: Axes) -> Bool[np.ndarray, "rows columns"]:

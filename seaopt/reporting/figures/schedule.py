@@ -57,7 +57,7 @@ def _draw_bandwidth(schedule: ScheduledController, axis: Axes) -> None:
     """Draw the bandwidth of the schedule, and that of the law of its fallback alone."""
     tuned = zip(schedule.points, schedule.controllers, strict=True)
     reached = [(point, controller.achieved.bandwidth_hz) for point, controller in tuned]
-    reached += [(place.value, place.bandwidth_hz) for place in schedule.between]
+    reached += [(figures.value, figures.bandwidth_hz) for figures in schedule.between]
     fallback = schedule.controllers[schedule.points.index(schedule.fallback)]
     plants = [(value, schedule.at(value).design or schedule.design) for value in schedule.points]
     alone = [(value, fallback.close(*plant).figures().bandwidth_hz) for value, plant in plants]
@@ -65,19 +65,19 @@ def _draw_bandwidth(schedule: ScheduledController, axis: Axes) -> None:
     labels = "schedule", f"the law of {schedule.over} = {schedule.fallback:g} everywhere"
     for curve, style, colour, label in zip(curves, ("o-", "s--"), (BLUE, VERMILION), labels, strict=True):
         axis.plot([x for x, _ in curve], [y for _, y in curve], style, color=colour, markersize=3, label=label)
-    asked = [schedule.asked_hz(x) for x in schedule.points]
-    axis.plot(schedule.points, asked, ":", color=MEASURED, label="asked")
-    axis.set_ylim(0.0, 1.15 * max([*asked, *(y for curve in curves for _, y in curve)]))
+    wanted_hz = [schedule.asked_hz(x) for x in schedule.points]
+    axis.plot(schedule.points, wanted_hz, ":", color=MEASURED, label="asked")
+    axis.set_ylim(0.0, 1.15 * max([*wanted_hz, *(y for curve in curves for _, y in curve)]))
 
 
 def _draw_sensitivity(schedule: ScheduledController, certificate: Certificate | None, axis: Axes) -> None:
     """Draw the largest Ms of all plants, the worst cases found, and the proved bound."""
     if certificate is None:
-        rows = [(place.value, place.ms) for place in schedule.between]
+        rows = [(each.value, each.ms) for each in schedule.between]
     else:
         places = list(zip(certificate.values, certificate.places, strict=True))
-        rows = [(value, max(loop.ms for loop in place.plants.values())) for value, place in places]
-        worst = [(value, max(case.ms for case in place.worst.values())) for value, place in places]
+        rows = [(value, max(loop.ms for loop in each.plants.values())) for value, each in places]
+        worst = [(value, max(case.ms for case in each.worst.values())) for value, each in places]
         axis.plot(*zip(*worst, strict=True), "^", color=VERMILION, markersize=4, label="worst case found")
         proved: dict[tuple[float, float], float] = {}
         for stretch in certificate.stretches:  # of every plant

@@ -155,8 +155,8 @@ def _draw_numbers(side: Side, size: float, reach: float, gid: str) -> None:
     transform = offset_copy(side.transform, side.axes.get_figure(root=True), *shift, units="points")
     look: dict[str, Any] = {"ha": "center", "va": "top"} if flat else {"ha": "right", "va": "center_baseline"}
     look |= {"fontsize": size, "transform": transform, "zorder": DEPTH, "clip_on": False}
-    for number, (place, label) in enumerate(zip(side.major, side.labels, strict=True)):
-        at = (place, 0.0) if flat else (0.0, place)
+    for number, (position, label) in enumerate(zip(side.major, side.labels, strict=True)):
+        at = (position, 0.0) if flat else (0.0, position)
         side.axes.add_artist(Text(*at, label, gid=f"{gid}_{number}", **look))
     if side.axis.label.get_text() and side.labels:
         taken = line_height(size) if flat else max(text_width(label, size) for label in side.labels)

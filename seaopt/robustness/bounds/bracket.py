@@ -320,14 +320,14 @@ def _step(search: _BranchAndBound) -> None:
     scale = np.maximum(search.lower, 1.0)
     np.maximum.at(worst, search.arcs.box, np.maximum(search.arcs.s / scale[0], search.arcs.t / scale[1]))
     order = np.argsort(-worst, kind="stable")
-    chosen, others = np.sort(order[:BOX_BLOCK]), np.sort(order[BOX_BLOCK:])
+    chosen, remaining = np.sort(order[:BOX_BLOCK]), np.sort(order[BOX_BLOCK:])
     boxes, arcs = take_rows(search.boxes, chosen), _take_arcs_of(search.arcs, chosen, worst.size)
-    waiting = _take_arcs_of(search.arcs, others, worst.size)
+    waiting = _take_arcs_of(search.arcs, remaining, worst.size)
     stable = _measure(search, boxes.centre)
     sampled = _enclose(search, boxes)
     left, blame = _bound_block(search, sampled, boxes, arcs, stable)
     search.count += chosen.size
-    search.boxes, search.arcs = take_rows(search.boxes, others), waiting
+    search.boxes, search.arcs = take_rows(search.boxes, remaining), waiting
     if left.box.size:
         _halve(search, boxes, left, blame)
 

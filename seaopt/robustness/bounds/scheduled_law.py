@@ -111,10 +111,10 @@ def _write_matrices(
     position = None if outer is None else find_position(plant, outer)
     if outer is not None and position is not None:
         stiffness, damping, pole, rate = outer.numbers
-        kept["outer"], place = ca.SX.sym("outer"), reads[position]
-        speed = kept["outer"] + rate * place
-        reference = -stiffness * place - damping * speed
-        after["outer"] = pole * speed - keep_share(position) * rate * place
+        kept["outer"], link = ca.SX.sym("outer"), reads[position]
+        speed = kept["outer"] + rate * link
+        reference = -stiffness * link - damping * speed
+        after["outer"] = pole * speed - keep_share(position) * rate * link
     reference = reference + reads.get(WEIGHT, 0.0)
     force = [reads[name] for name in middle.signals]
     command = ca.SX.sym("command") if table.nominals else None
@@ -160,7 +160,7 @@ def _expand_law(f: Taylor, b: Taylor, c: Taylor, blocks: Sequence[tuple[int, ...
     whole = make_constant(np.ones((count, 1)), over)
     states: dict[int, list[Taylor]] = {}  # over `whole`, for each column
     for block in blocks:
-        adjugate, own = _expand_block(f, block)
+        adjugate, determinant = _expand_block(f, block)
         moved = [
             [
                 add_polynomials([whole * b[:, i, k : k + 1], *(states[j][k] * f[:, i, j : j + 1] for j in states)])
@@ -168,14 +168,14 @@ def _expand_law(f: Taylor, b: Taylor, c: Taylor, blocks: Sequence[tuple[int, ...
             ]
             for i in block
         ]
-        states = {j: [multiply_polynomials(each, own) for each in state] for j, state in states.items()}
+        states = {j: [multiply_polynomials(each, determinant) for each in state] for j, state in states.items()}
         for row, i in enumerate(block):
             parts = adjugate[row]
             states[i] = [
                 add_polynomials([multiply_polynomials(parts[j], moved[j][k]) for j in range(len(block))])
                 for k in range(columns)
             ]
-        whole = multiply_polynomials(whole, own)
+        whole = multiply_polynomials(whole, determinant)
     size = whole.c.shape[1]
     nothing = make_constant(np.zeros((count, size)), over)
     return whole, [

@@ -78,15 +78,15 @@ def bound_stretch(
     """
     values = ParameterSet(replace(each, std=None) for each in params.values())  # of a fit its values alone count here
     plant = place_plant(plant, table.over, table.unit)
-    place = PLACE if PLACE in plant.parameters else table.over
-    law = ScheduledLaw.of(table, low, high, middle, plant, place)
-    unknown = combine_uncertainty(values, ParameterSet(), {place: (low, high)}, {name: plant})
+    variable = PLACE if PLACE in plant.parameters else table.over
+    law = ScheduledLaw.of(table, low, high, middle, plant, variable)
+    unknown = combine_uncertainty(values, ParameterSet(), {variable: (low, high)}, {name: plant})
     unknown = replace(unknown, names=(), covariance=np.zeros((0, 0)))
     bounded = bracket(middle, plant, unknown, budget=BUDGET, scheduled=law)
     worst = {name: np.array([value]) for name, value in bounded.parameters.items()}
     broken, reason = _name_broken(law, unknown.nominal, worst) if worst else "", ""
     if not bounded.bounded_stable and not np.isfinite(bounded.ms_lower):
-        reason = f"at {table.over} = {bounded.parameters[place]:.6g} {broken}"
+        reason = f"at {table.over} = {bounded.parameters[variable]:.6g} {broken}"
     elif not bounded.bounded_stable:
         ended = ", with which the search ends" * (bounded.boxes >= BUDGET.boxes)
         reason = ", ".join(filter(None, (f"no bound in {bounded.boxes} boxes{ended}", bounded.left_out)))
@@ -96,7 +96,7 @@ def bound_stretch(
         high=high,
         ms=np.inf if reason else bounded.ms_upper,
         reason=reason,
-        broken_at=bounded.parameters[place] if broken else None,
+        broken_at=bounded.parameters[variable] if broken else None,
         broken=broken,
     )
 

@@ -98,7 +98,7 @@ class Survey:
     options: CertifyOptions
     drawing: np.random.Generator  # of the draws that are counted
     rng: np.random.Generator  # of all others
-    others: ParameterSet = field(default_factory=ParameterSet)  # of parameters that the source does not have
+    supplement: ParameterSet = field(default_factory=ParameterSet)  # of parameters that the source does not have
     place: tuple[str, float] | None = None  # a schedule's variable and its value; draws are then judged together
     point: bool = True  # whether the law was tuned for just this
     steps: bool = True  # whether steps are simulated,
@@ -170,9 +170,9 @@ class Check:
 
 def ask(checks: Sequence[Check], survey: Survey, progress: Progress) -> Evidence:
     """Return what each of some checks that applies finds, with the fields that were found before."""
-    asked = [check for check in checks if check.applies(survey)]
+    applicable = [check for check in checks if check.applies(survey)]
     rows, remarks = list[Requirement](), list[str]()
-    for check, part in zip(asked, divide(progress, *(check.seconds(survey) for check in asked)), strict=True):
+    for check, part in zip(applicable, divide(progress, *(check.seconds(survey) for check in applicable)), strict=True):
         if survey.ends_early and not check.brief(survey):
             remarks += [] if ENDED in remarks else [ENDED]
             continue
@@ -196,14 +196,14 @@ def pose(
     plants: Plants,
     parameters: Source,
     ranges: Ranges,
-    others: ParameterSet,
+    supplement: ParameterSet,
     bounds: Budget | None = None,
 ) -> dict[float | None, Cases]:
     """Return the cases of a law, by None; of a schedule those of the law frozen at each value at which it is certified,
     its points and between them. Raises ControlError: the variable has a range, or is estimated by the fit.
     """
     if isinstance(law, Controller):
-        return {None: pose_cases(law, plants, parameters, ranges, others, bounds)}
+        return {None: pose_cases(law, plants, parameters, ranges, supplement, bounds)}
     over, posed = law.over, dict[float | None, Cases]()
     if over in ranges:
         raise ControlError(f"range of {over}: the schedule is over it, and its points are its range; take it out")
@@ -214,7 +214,7 @@ def pose(
     # What it was tuned on besides is judged by the checks, with all other plants; a feedforward finds its link there.
     alone = law if law.spec.link_feedforward else replace(law, others={})
     for value in sorted({*law.points, *list_inner(law.points, PARTS)}):
-        variable, source, other = Parameter(name=over, value=value, unit=law.unit), parameters, others
+        variable, source, other = Parameter(name=over, value=value, unit=law.unit), parameters, supplement
         if isinstance(source, ParameterSet):
             source = source.with_parameters(variable)
         elif over in source.parameters:
@@ -230,7 +230,7 @@ def pose_cases(
     plants: Plants,
     parameters: Source,
     ranges: Ranges,
-    others: ParameterSet,
+    supplement: ParameterSet,
     bounds: Budget | None = None,
 ) -> Cases:
     """Return a controller on its plants, the design plant's among them, with what is uncertain of them."""
@@ -242,11 +242,11 @@ def pose_cases(
     seen = {name: controller.see(plant) for name, plant in plants.items()}
     models = add_design(design, seen)
     if len(models) > len(seen):  # the design plant has its own values of what nobody else gives
-        missing = (values[name] for name in values if name in design.parameters and name not in others)
-        others = others.with_parameters(*missing)
+        missing = (values[name] for name in values if name in design.parameters and name not in supplement)
+        supplement = supplement.with_parameters(*missing)
     models = split_delayed(controller.spec, design, models, parameters)
-    ranges = _add_warm_winding(ranges, models, parameters, others)
-    unknown = combine_uncertainty(parameters, others, ranges, models, find_own_drive(controller, parameters))
+    ranges = _add_warm_winding(ranges, models, parameters, supplement)
+    unknown = combine_uncertainty(parameters, supplement, ranges, models, find_own_drive(controller, parameters))
     _check_delay(controller, unknown.ranges)
     plants = split_states(controller, models, unknown.nominal, [row.name for row in unknown.varied()])
     return Cases(controller=controller, models=models, plants=plants, unknown=unknown, bounds=bounds)
@@ -282,11 +282,11 @@ def digest_laws(*laws: Controller) -> int:
 
 
 def _add_warm_winding(
-    ranges: Ranges, models: Plants, parameters: Source, others: ParameterSet
+    ranges: Ranges, models: Plants, parameters: Source, supplement: ParameterSet
 ) -> dict[str, tuple[float, float]]:
     """Return the ranges with the temperatures of every winding that changes its loop, and those given for the air."""
     fitted = parameters.parameters if isinstance(parameters, Fit) else parameters
-    values = others.with_parameters(*fitted.values())
+    values = supplement.with_parameters(*fitted.values())
     warm = [ends for plant in models.values() if (ends := find_warm_range(plant, values)) is not None]
     if not warm:
         return dict(ranges)

@@ -191,7 +191,7 @@ class Certificate(Result, Worded):
     @property
     def values(self) -> tuple[float, ...]:
         """The values of a schedule's variable at `places`."""
-        return tuple(place.place[1] for place in self.places if place.place is not None)
+        return tuple(certificate.place[1] for certificate in self.places if certificate.place is not None)
 
     @property
     def fastest(self) -> float:
@@ -324,8 +324,8 @@ class Certificate(Result, Worded):
             return seal({"schema": ROBUSTNESS_SCHEMA} | self.list_content() | {"schedule": None})
         over = self.schedule.over
         written = [
-            {"place": {over: value}} | place.list_content()
-            for value, place in zip(self.values, self.places, strict=True)
+            {"place": {over: value}} | certificate.list_content()
+            for value, certificate in zip(self.values, self.places, strict=True)
         ]
         return seal(
             {
@@ -395,7 +395,7 @@ class Certificate(Result, Worded):
         yield from (self.proof, self.assumption)
         yield from (f"{name}: {describe_sweeps(sweeps, unit)}" for name, sweeps in self.sweeps.items())
         yield from (f"{name}: {describe_motion(motion, over, unit)}" for name, motion in self.motions.items())
-        said = dict(zip(self.values, (place.notes for place in self.places), strict=True))
+        said = dict(zip(self.values, (certificate.notes for certificate in self.places), strict=True))
         shared = [note for note in next(iter(said.values())) if all(note in notes for notes in said.values())]
         yield from shared
         for value in schedule.points:

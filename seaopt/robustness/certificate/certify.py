@@ -219,7 +219,7 @@ def certify(
         Survey,
         subject=subject,
         source=parameters,
-        others=others,
+        supplement=others,
         options=options,
         simulations=simulations and not isinstance(subject, ForceMPC),
         large_signals=large_signals,
@@ -281,7 +281,7 @@ def _list_surveys(
         rng = np.random.default_rng([options.seed, CERTIFICATE_STREAM, digest_laws(cases.controller)])
         return [make(shared=Shared(cases), drawing=rng, rng=rng, steps=bool(cases.models))]
     drawing = np.random.default_rng([options.seed, digest_laws(*subject.controllers)])
-    held = subject.over not in subject.design[0].states
+    standing = subject.over not in subject.design[0].states
     return [
         make(
             shared=Shared(cases),
@@ -290,7 +290,7 @@ def _list_surveys(
             rng=rng,
             place=(subject.over, value),
             point=value in subject.points,
-            steps=held and value in subject.points,
+            steps=standing and value in subject.points,
         )
         for (value, cases), rng in zip(posed.items(), drawing.spawn(len(posed)), strict=True)
         if value is not None
@@ -311,7 +311,7 @@ def _certify_schedule(whole: Survey, progress: Progress) -> Certificate:
     found = {"places": (*places,)}
     joint = _certify_cases(replace(whole, found=found, broken=broken), SCHEDULE_CHECKS, joining)
     progress(f"{format_count(len(places), 'value')} of {schedule.over}", 1.0)
-    of_places = (row for place in places for row in place.requirements)
+    of_places = (row for certificate in places for row in certificate.requirements)
     return replace(
         joint,
         controller=schedule.controllers[0],

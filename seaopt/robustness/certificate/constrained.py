@@ -249,8 +249,8 @@ class _Case:
             plan, kept = state
             if outer is not None:
                 y, position = y if moved else (y, 0.0)
-                place, force = outer.split(r / outer.per_given)
-                kept = follow_link(outer.numbers, kept, place, float(position))
+                x_0, force = outer.split(r / outer.per_given)
+                kept = follow_link(outer.numbers, kept, x_0, float(position))
                 r = force + kept[-1]
             steps.append(mpc.step(plan, r, float(y)))
             return steps[-1].current_A, (steps[-1].state, kept)
@@ -278,8 +278,8 @@ class _Case:
         limit = abs(mpc.static_gain) * mpc.command_limit
         _, phase, lasting = _count_samples(mpc)
         peak, off = float(np.max(np.abs(run.force))), np.abs(run.force - target)
-        held = f"{peak:.4g} {run.unit}, and the limits hold {limit:.4g} {run.unit}"
-        judge.require(DIVERGED, peak, RUNAWAY * limit, held, run.unit)
+        described = f"{peak:.4g} {run.unit}, and the limits hold {limit:.4g} {run.unit}"
+        judge.require(DIVERGED, peak, RUNAWAY * limit, described, run.unit)
         first, second = np.max(off[-lasting : -lasting // 2]), float(np.max(off[-lasting // 2 :]))
         grows = f"the error grows to {second:.4g} {run.unit} over the last phase"
         judge.require(DIVERGED, second, GROWTH * first + SETTLED * limit, grows, run.unit)
@@ -429,11 +429,11 @@ def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
 
 def _draw_references(mpc: ForceMPC, rng: np.random.Generator) -> tuple[Signal, Signal]:
     """Return the reference of a run, and the disturbance of its command, which lasts a phase and what is judged."""
-    rest, phase, last = _count_samples(mpc)
+    resting, phase, last = _count_samples(mpc)
     force = rng.choice([-1.0, 1.0]) * rng.uniform(*STEP_SHARES) * abs(mpc.static_gain) * mpc.command_limit
     disturbance = rng.uniform(-1.0, 1.0) * DISTURBANCE_SHARE * mpc.command_limit
-    reference = np.concatenate([np.zeros(rest), np.full(phase, force), np.full(phase + last, -force)])
-    return reference, np.concatenate([np.zeros(rest + 2 * phase), np.full(last, disturbance)])
+    reference = np.concatenate([np.zeros(resting), np.full(phase, force), np.full(phase + last, -force)])
+    return reference, np.concatenate([np.zeros(resting + 2 * phase), np.full(last, disturbance)])
 
 
 def _count_samples(mpc: ForceMPC) -> tuple[int, int, int]:

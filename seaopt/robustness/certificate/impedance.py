@@ -157,13 +157,13 @@ def draw_impedance(survey: Survey, progress: Progress) -> ImpedanceDraws | None:
     if pairs is None:
         return None
     draw, (_, margin) = min(pairs, key=lambda pair: pair[1][1])
-    own = survey.cases.models[name].parameters
+    parameters = survey.cases.models[name].parameters
     return ImpedanceDraws(
         samples=len(pairs),
         stable=sum(rests for _, (rests, _) in pairs),
         passive=sum(margin > 0.0 for _, (_, margin) in pairs),
         margin=margin,
-        parameters={key: value for key, value in draw.items() if key in own},
+        parameters={key: value for key, value in draw.items() if key in parameters},
     )
 
 

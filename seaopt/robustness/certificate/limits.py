@@ -116,14 +116,14 @@ def _find_law(survey: Survey, name: str, response: MeasuredResponse) -> tuple[Co
         return survey.cases.controller, None
     source, schedule = survey.source, survey.schedule
     fitted = source.parameters if isinstance(source, Fit) else source
-    values, (first, *_, last) = survey.others.with_parameters(*fitted.values()), schedule.points
-    place = find_response_place(schedule.over, name, response, values)
-    if not first <= place <= last:
+    values, (first, *_, last) = survey.supplement.with_parameters(*fitted.values()), schedule.points
+    taken_at = find_response_place(schedule.over, name, response, values)
+    if not first <= taken_at <= last:
         raise ControlError(
-            f"measured: {name} was taken at {schedule.over} = {place:g}, outside the points; leave it out, or give "
+            f"measured: {name} was taken at {schedule.over} = {taken_at:g}, outside the points; leave it out, or give "
             "points that reach there"
         )
-    return schedule.at(place), (schedule.over, place)
+    return schedule.at(taken_at), (schedule.over, taken_at)
 
 
 def judge_logs(survey: Survey, _: Progress) -> Evidence:
@@ -171,8 +171,8 @@ def describe_log(log: LogVerdict) -> str:
 def _find_log_place(over: str, fit: Fit, experiment: Experiment) -> float:
     """Return where a schedule's variable stood in a log: a parameter at its value, a state at rest."""
     values = experiment.apply_own(fit.parameters)
-    known = values if over in values else experiment.plant.defaults
-    return known[over].value if over in known else 0.0
+    source = values if over in values else experiment.plant.defaults
+    return source[over].value if over in source else 0.0
 
 
 NOMINAL = Check(measure=measure_nominal, brief=lambda _: True)
@@ -193,8 +193,8 @@ def design_requirements(
     (state, achieved), *stuck = figures.items()
     band, port = controller.spec.passive_band_hz, None
     if band is not None and controller.design is not None:
-        held = port_of(states[state], controller.delay(values), controller.signals, controller.command.per_effort)
-        port = measure_port(held, controller.law, controller.compute_delay_samples, band)
+        port_plant = port_of(states[state], controller.delay(values), controller.signals, controller.command.per_effort)
+        port = measure_port(port_plant, controller.law, controller.compute_delay_samples, band)
     rows = _judge(controller, controller.measure("", achieved, port), "design plant", Spot(DESIGN_PLANT, state))
     for other, loop in stuck:
         measured = controller.measure("", loop)
@@ -260,11 +260,11 @@ def _remark_amplitude(cases: Cases, plant: Plant) -> tuple[str, ...]:
     """
     controller, nominal = cases.controller, cases.unknown.nominal
     name = next(name for name, model in cases.models.items() if model is plant)
-    rest, sliding = controller.force_limit(0.0), controller.achieved.bandwidth_hz
-    if rest is None or sliding is None or not has_friction(plant, nominal):
+    holding, sliding = controller.force_limit(0.0), controller.achieved.bandwidth_hz
+    if holding is None or sliding is None or not has_friction(plant, nominal):
         return ()
     low, high = STEP_SHARES[0], STEP_SHARES[-1]
-    bands = predict_bandwidths(controller, plant, nominal, rest * np.geomspace(low, high, AMPLITUDES))
+    bands = predict_bandwidths(controller, plant, nominal, holding * np.geomspace(low, high, AMPLITUDES))
     reached = [band for band in bands if band is not None]
     at = f"at {100 * low:g} to {100 * high:g} % of the current"
     if not reached:

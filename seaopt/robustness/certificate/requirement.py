@@ -128,8 +128,8 @@ class Requirement(Result):
     @property
     def subject(self) -> str:
         """Whose figure it is in words: the schedule's value, the plant and the state of its friction."""
-        place = "" if self.place is None else "{} = {:.4g}".format(*self.place)
-        return ", ".join(filter(None, (place, f"{self.plant} {self.state}".strip())))
+        where_in_schedule = "" if self.place is None else "{} = {:.4g}".format(*self.place)
+        return ", ".join(filter(None, (where_in_schedule, f"{self.plant} {self.state}".strip())))
 
     @property
     def where(self) -> str:

@@ -64,9 +64,9 @@ def measure_stretches(survey: Survey, progress: Progress) -> Evidence:
 def join_places(survey: Survey, _: Progress) -> Evidence:
     """Count the draws of all values together, require the worst of all, and return each plant at its worst place."""
     places: Sequence[Certificate] = survey.found["places"]
-    counts, worst = join_counts([place.monte_carlo for place in places]), dict[Spot, Worst]()
-    for at, place in zip(survey.places, places, strict=True):
-        worst |= name_worst(at, place.worst)
+    counts, worst = join_counts([certificate.monte_carlo for certificate in places]), dict[Spot, Worst]()
+    for at, certificate in zip(survey.places, places, strict=True):
+        worst |= name_worst(at, certificate.worst)
     rows = draw_requirements(counts, worst, survey.options.max_failure_probability)
     fields = {"monte_carlo": counts, **take_worst(places)}
     return Evidence(requirements=rows, fields=fields, scope="drawn", risk=counts.risk)
@@ -75,13 +75,13 @@ def join_places(survey: Survey, _: Progress) -> Evidence:
 def take_worst(places: Sequence[Certificate]) -> dict[str, Any]:
     """Return the figures and the worst case of each plant at its worst place, as fields of a certificate."""
     at: dict[str, Certificate] = {}
-    for place in places:
-        for name, case in place.worst.items():
+    for certificate in places:
+        for name, case in certificate.worst.items():
             if name not in at or case.severity > at[name].worst[name].severity:
-                at[name] = place
+                at[name] = certificate
     return {
-        "plants": {name: place.plants[name] for name, place in at.items()},
-        "worst": {name: place.worst[name] for name, place in at.items()},
+        "plants": {name: certificate.plants[name] for name, certificate in at.items()},
+        "worst": {name: certificate.worst[name] for name, certificate in at.items()},
     }
 
 
@@ -126,12 +126,12 @@ def _bound_plants(
     out: list[StretchBound] = []
     for name, model in models.items():
         plant, later = place_plant(model, schedule.over, schedule.unit), None
-        place = schedule.over if schedule.over in {*plant.parameters, *plant.states} else PLACE
+        variable = schedule.over if schedule.over in {*plant.parameters, *plant.states} else PLACE
         if last is not None and last != first:
-            later = LaterTerms(terms=last, over=place, low=low, high=high)
-        values = place_variable(plant, nominal, place, 0.5 * (low + high))
+            later = LaterTerms(terms=last, over=variable, low=low, high=high)
+        values = place_variable(plant, nominal, variable, 0.5 * (low + high))
         for label, variant in split_states(middle, {name: plant}, values, later=later).items():
-            if later is not None and place in plant.states and feeds_back(replace(middle, outer=None), variant):
+            if later is not None and variable in plant.states and feeds_back(replace(middle, outer=None), variant):
                 out.append(StretchBound(plant=label, low=low, high=high, ms=np.inf, reason=TERMS_CHANGE))
                 continue
             out.append(bound_stretch(label, middle, schedule.table, variant, values, low, high))
@@ -143,13 +143,13 @@ def _require_limits_between(schedule: ScheduledController) -> list[Requirement]:
     return [
         require_at_most(
             BETWEEN,
-            float(len(place.broken)),
+            float(len(figures.broken)),
             0.0,
-            place=(schedule.over, place.value),
-            text=", ".join(place.broken),
-            remedy=schedule.remedy if place.broken else "",
+            place=(schedule.over, figures.value),
+            text=", ".join(figures.broken),
+            remedy=schedule.remedy if figures.broken else "",
         )
-        for place in schedule.between
+        for figures in schedule.between
     ]
 
 

@@ -168,11 +168,11 @@ def _seek(shared: Shared[Cases], model: tuple[str, bool]) -> tuple[FoundCycle, .
     return seek_limit_cycles(cases.controller, cases.models[name], cases.unknown.nominal, shown=shown)
 
 
-def select_simulated(models: Plants, place: tuple[str, float] | None) -> dict[str, Plant]:
+def select_simulated(models: Plants, at: tuple[str, float] | None) -> dict[str, Plant]:
     """Return the models that are simulated. Where a plant moves a schedule's variable, a law that is frozen there is
     not what runs.
     """
-    over = "" if place is None else place[0]
+    over = "" if at is None else at[0]
     return {name: plant for name, plant in models.items() if over not in plant.states}
 
 

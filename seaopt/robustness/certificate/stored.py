@@ -184,8 +184,8 @@ def build_certificate(
     if len(found.places) != len(posed):
         raise FileError(f"{FILE}: has {len(found.places)} places, and the schedule {len(posed)}; {CERTIFY_AGAIN}")
     places = tuple(
-        _build_one(place, written, cases, (law.over, value))
-        for place, written, (value, cases) in zip(
+        _build_one(stored_at, written, cases, (law.over, value))
+        for stored_at, written, (value, cases) in zip(
             found.places, content["schedule"]["places"], posed.items(), strict=True
         )
         if value is not None
@@ -322,7 +322,7 @@ def read_requirements(content: Mapping[str, Any], source: str = FILE) -> tuple[R
     if not stored:
         raise FileError(f"{source}: requirements is empty, and a certificate requires something; {CERTIFY_AGAIN}")
     places = [next(iter((row.get("place") or {}).items()), None) for row in plain(content["requirements"])]
-    rows = tuple(replace(row, place=place) for row, place in zip(stored, places, strict=True))
+    rows = tuple(replace(row, place=at) for row, at in zip(stored, places, strict=True))
     for row in rows:
         sense = find_sense(row.name)
         if row.sense not in (sense, "≥" if sense == "=" else sense):  # a law that is given may have more

@@ -199,12 +199,12 @@ class Uncertainty:
 
 
 def combine_uncertainty(
-    source: Source, others: ParameterSet, ranges: Ranges, plants: Plants, drive: Drive | None = None
+    source: Source, supplement: ParameterSet, ranges: Ranges, plants: Plants, drive: Drive | None = None
 ) -> Uncertainty:
     """Combine a fit's covariance, of noise and model, (or prior_stds) and the declared ranges into one description.
 
-    `others` has the values of parameters that `source` lacks; those with a prior_std are uncertain too. `drive` has the
-    drive's delay, which is uncertain as the fit of one experiment left it, together with the parameters.
+    `supplement` has the values of parameters that `source` lacks; those with a prior_std are uncertain too. `drive` has
+    the drive's delay, which is uncertain as the fit of one experiment left it, together with the parameters.
 
     Raises
     ------
@@ -227,22 +227,22 @@ def combine_uncertainty(
                     "fix it, give it a prior_std, or give its range"
                 )
         with_prior = [p for p in nominal.values() if p.prior_std is not None and p.name not in names]
-        others = others.subset(name for name in others if name not in nominal).with_parameters(*with_prior)
+        supplement = supplement.subset(name for name in supplement if name not in nominal).with_parameters(*with_prior)
     else:
         if any(p.std is not None for p in source.values()):
             raise ControlError(
                 "the parameters come from a fit, whose covariance they do not carry; give the Fit itself"
             )
         nominal, names, matrix = ParameterSet(), (), np.zeros((0, 0))
-        others = others.with_parameters(*source.values())
-    stds = {name: p.prior_std for name, p in others.items() if p.prior_std is not None}
+        supplement = supplement.with_parameters(*source.values())
+    stds = {name: p.prior_std for name, p in supplement.items() if p.prior_std is not None}
     whole = np.asarray(block_diag(matrix, np.diag(np.square(list(stds.values())))))
     uncertain = (*names, *stds)
     plant_names.add(DRIVE_DELAY)
     used = [
         i for i, name in enumerate(uncertain) if name not in ranges and name in plant_names and np.isfinite(whole[i, i])
     ]
-    nominal = nominal.with_parameters(*others.values())
+    nominal = nominal.with_parameters(*supplement.values())
     if drive is not None:
         nominal = nominal.with_parameters(Parameter(name=DRIVE_DELAY, value=drive.delay_s, unit="s", min=0.0))
     nominal, scale = _in_plant_units(nominal, plants)
@@ -367,11 +367,11 @@ def _tabulate_mode(plant: Plant, nominal: ParameterSet, wanted: tuple[float, flo
     plant = leave_out_waves(plant)
     mode, complete = _mode(plant), plant.complete(nominal)
     values = complete[mode.parameter].value * np.geomspace(20.0, 0.05, 400)
-    place = list(plant.states).index(mode.state)
+    row = list(plant.states).index(mode.state)
     frequencies = np.empty(values.size)
     for k, value in enumerate(values):
         poles, vectors = np.linalg.eig(state_space(plant, complete.update(**{mode.parameter: float(value)}))[0])
-        part = np.abs(vectors[place] * np.linalg.inv(vectors)[:, place]) * (np.imag(poles) > 0.0)
+        part = np.abs(vectors[row] * np.linalg.inv(vectors)[:, row]) * (np.imag(poles) > 0.0)
         frequencies[k] = np.abs(poles[np.argmax(part)]) / (2 * np.pi)
     turns = np.flatnonzero(np.diff(frequencies) <= 0.0)
     start = int(turns[-1]) + 1 if turns.size else 0

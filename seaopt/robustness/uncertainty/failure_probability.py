@@ -101,5 +101,5 @@ def format_draws(draws: MonteCarlo) -> str:
 
 
 def _format_confidence(value: float) -> str:
-    rest = 1.0 - value
-    return f"1 - {rest:.0e}" if rest < 1e-3 else f"{value:.3%}"
+    complement = 1.0 - value
+    return f"1 - {complement:.0e}" if complement < 1e-3 else f"{value:.3%}"

@@ -92,7 +92,7 @@ class _Record:
 
     experiment: Experiment
     samples: Samples
-    own: Nuisance
+    nuisance: Nuisance
     command: Any
     model: Any  # outputs by rows, as the sensors' gains have them
     error: Any
@@ -147,7 +147,7 @@ def _list_records(fit: Fit, experiment: Experiment, controller: Controller) -> I
     whole = _Record(
         experiment=experiment,
         samples="fitted" if any(_shares(each, experiment, fit.holdout) for each in fit.experiments) else "validate",
-        own=predicted.own,
+        nuisance=predicted.own,
         command=experiment.log[controller.command.input],
         model=model,
         error=error,
@@ -197,9 +197,9 @@ def _weigh(controller: Controller, part: _Record, f: Lines) -> Complex[np.ndarra
     ratio = hold_response(f, Clock(period=controller.sample_time_s)) / hold_response(f, clock)
     given, late = find_given_drive_delay(controller.spec), controller.spec.loop_delay_samples * controller.sample_time_s
     if controller.spec.delay_samples is not None:  # the whole loop, with the log's delay in it
-        late = max(late - part.own.delay_s, 0.0)
+        late = max(late - part.nuisance.delay_s, 0.0)
     elif given is not None:
-        late += given - part.own.delay_s
+        late += given - part.nuisance.delay_s
     return feedback * (controller.command.per_effort * ratio * np.exp(-2j * np.pi * f * late))
 
 
@@ -207,7 +207,7 @@ def _find_base(controller: Controller, params: ParameterSet, part: _Record, f: L
     """Return the linear model's outputs per input as the log's clock has them."""
     experiment = part.experiment
     model = linearise(make_model(experiment.plant, experiment.apply_own(params), (), part.names))
-    clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=part.own.delay_s)
+    clock = Clock(period=experiment.log.period, hold=experiment.hold, delay_s=part.nuisance.delay_s)
     source = list(experiment.plant.inputs).index(controller.command.input)
     return sampled_response(model, np.zeros(0), clock, f, source)[0].T
 
@@ -314,8 +314,8 @@ def _is_turned(model: Any, error: Any, radius: Any) -> bool:
     ratio = 1.0 + error / model
     steps = np.angle(ratio[1:] / ratio[:-1])
     ends = [abs(error[k]) + radius[k] < abs(model[k]) for k in (0, -1)]
-    known = np.all(np.abs(ratio) * np.abs(model) > radius) and np.all(np.abs(steps) < 0.5 * np.pi)
-    return bool(all(ends) and known and abs(np.sum(steps)) > np.pi)
+    certain = np.all(np.abs(ratio) * np.abs(model) > radius) and np.all(np.abs(steps) < 0.5 * np.pi)
+    return bool(all(ends) and certain and abs(np.sum(steps)) > np.pi)
 
 
 def _ask_band(controller: Controller, lines: _Lines) -> tuple[float, float]:

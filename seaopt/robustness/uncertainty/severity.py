@@ -134,9 +134,9 @@ def _radius_slopes(controller: Controller, loop: Products, sampled: _SampledPlan
     rows = np.arange(len(loop.closed))
     at = np.argmax(np.abs(loop.closed), axis=1)
     pole = loop.closed[rows, at]
-    others = pole[:, None] - loop.closed
-    others[rows, at] = 1.0
-    steepness = np.prod(others, axis=1) / np.prod(pole[:, None] - loop.opened, axis=1) / loop.scale
+    distances = pole[:, None] - loop.closed
+    distances[rows, at] = 1.0
+    steepness = np.prod(distances, axis=1) / np.prod(pole[:, None] - loop.opened, axis=1) / loop.scale
     moved = -_loop_slopes(controller, sampled, pole) / steepness[:, None]
     return np.real(np.conj(pole)[:, None] * moved) / np.abs(pole)[:, None]
 

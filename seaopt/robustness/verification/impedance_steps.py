@@ -72,10 +72,10 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
     # A gate that gives its sensor up lets the link hang, which would pass for rest.
     stage = Stage(controller=replace(controller, gate=None), plant=plant)
     samples, farthest = _count_samples(controller, plant, completed), _find_farthest(plant, completed)
-    rest, dry = controller.force_limit(0.0), sum(find_dry_friction(plant, completed).values())
+    holding, dry = controller.force_limit(0.0), sum(find_dry_friction(plant, completed).values())
     efforts = [NOMINAL_EFFORT[controller.command.mechanics]]  # N or N m, that a step asks for at once
-    if rest is not None:
-        efforts = [share * rest for share in SHARES]
+    if holding is not None:
+        efforts = [share * holding for share in SHARES]
     elif dry:
         efforts = [share * dry for share in FRICTION_SHARES]
     steps: list[ImpedanceStep] = []

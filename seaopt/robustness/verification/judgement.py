@@ -223,13 +223,13 @@ class _Run:
     @property
     def rest_force(self) -> float:
         """The force of the rest where the run started."""
-        return 0.0 if self.trace.rest is None else float(self.trace.rest.force[self.index])
+        return 0.0 if self.trace.equilibrium is None else float(self.trace.equilibrium.force[self.index])
 
     @property
     def error(self) -> Signal:
         """Reference minus force, each relative to rest: a law without integrator rests at another reference."""
-        rest = self.trace.rest
-        offset = 0.0 if rest is None or not self.scenario.about_rest else rest.reference[self.index] - self.rest_force
+        start = self.trace.equilibrium
+        offset = 0.0 if start is None or not self.scenario.about_rest else start.reference[self.index] - self.rest_force
         return self.trace.reference[self.index] - self.force - offset
 
     @property
@@ -323,12 +323,12 @@ def _judge_extremes(run: _Run, judge: Judge) -> None:
 
 def _judge_rest(run: _Run, drawn: ParameterSet, judge: Judge) -> None:
     """Check that the motor can hold the plant where the draw puts it at rest."""
-    rest, limit, command = run.trace.rest, run.stage.controller.command_limit, run.stage.controller.command
-    if rest is None or limit is None:
+    start, limit, command = run.trace.equilibrium, run.stage.controller.command_limit, run.stage.controller.command
+    if start is None or limit is None:
         return
-    takes = abs(float(rest.current_A[run.index]))
+    takes = abs(float(start.current_A[run.index]))
     where = format_values({name: drawn[name].value for name in run.stage.plant.states if name in drawn}, missing="")
-    taken = command.show(float(rest.current_A[run.index]))
+    taken = command.show(float(start.current_A[run.index]))
     text = f"to rest at {where} takes {taken}, above the limit of {command.show(limit)}"
     judge.require("rest", takes, limit * (1.0 + ABOVE_LIMIT), text, command.unit, remedy="narrow its range")
 
@@ -336,7 +336,9 @@ def _judge_rest(run: _Run, drawn: ParameterSet, judge: Judge) -> None:
 def _judge_growth(run: _Run, judge: Judge) -> None:
     trace = run.trace
     if ENERGY in trace.outputs:
-        base = 0.0 if trace.rest is None or not run.scenario.about_rest else trace.rest.energy_J[run.index]
+        base = (
+            0.0 if trace.equilibrium is None or not run.scenario.about_rest else trace.equilibrium.energy_J[run.index]
+        )
         level, what = trace.outputs[ENERGY][run.index] - base, "the energy"
     else:
         with np.errstate(over="ignore"):

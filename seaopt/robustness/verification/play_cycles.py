@@ -91,8 +91,8 @@ def _predict(controller: Controller, loop: Loop, play: _Play) -> list[LimitCycle
     def find_pole(share: float) -> complex:
         a, b, c, d = (np.array(block)[None] for block in play.mix(share))
         a, b, c, d = hold(a, b, c, d, controller.sample_time_s, np.zeros(1))
-        held = replace(loop.plant, a=a[0], b=b[0], c=c[0], d=d[0])
-        poles = replace(loop, plant=held).eigenvalues()
+        chosen = replace(loop.plant, a=a[0], b=b[0], c=c[0], d=d[0])
+        poles = replace(loop, plant=chosen).eigenvalues()
         swinging = poles[np.abs(np.imag(poles)) > 0.0]
         return complex(swinging[np.argmax(np.abs(swinging))]) if swinging.size else 0j
 

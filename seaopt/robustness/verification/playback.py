@@ -106,7 +106,7 @@ class Playback:
     current: RunSamples  # A
     outputs: Mapping[str, RunSamples]  # and "energy" where declared; NaN while a held link has no such output
     peaks: Mapping[str, Float[np.ndarray, " runs"]]  # largest magnitudes, between samples too
-    rest: Equilibrium | None  # where runs started; None where the scenario has an initial state
+    equilibrium: Equilibrium | None  # where runs started; None where the scenario has an initial state
     edges: tuple[int, ...]  # first samples of the phases, and one past the last
     contacts: tuple[Contact, ...]
     faulted: Bool[np.ndarray, " runs"]  # the law's gate gave up the sensor
@@ -144,9 +144,9 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     delays = [[drawn.given[name] for name in DELAYS if name in drawn.given] for drawn in placed]
     longest = find_longest_delay(stage.plant, placed)
     carried = [drawn.with_parameters(*delay) for drawn, delay in zip(placed, delays, strict=True)]
-    rest = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), placed)
-    now, grip = _start_state(stage, scenario, placed, longest) if rest is None else rest.state, None
-    offset = rest.given[:, None] if rest is not None and scenario.about_rest else np.zeros((len(params), 1))
+    start = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), placed)
+    now, grip = _start_state(stage, scenario, placed, longest) if start is None else start.state, None
+    offset = start.given[:, None] if start is not None and scenario.about_rest else np.zeros((len(params), 1))
     outer = stage.law.outer
     per_force = 1.0 if outer is None else 1.0 / outer.per_given
     runs: list[LoopRun] = []
@@ -186,7 +186,7 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
         if outer is not None:
             still = dict(zip(loop.standing, standing.T, strict=False)).get(outer.position, np.zeros(1))
             positions.append(run.outputs.get(outer.position, np.broadcast_to(still[:, None], run.reference.shape)))
-    played = _join_phases(stage, runs, rest, tuple(contacts))
+    played = _join_phases(stage, runs, start, tuple(contacts))
     return played if outer is None else replace(played, reference=outer.ask(played.reference, np.hstack(positions)))
 
 
@@ -251,7 +251,7 @@ def _read_standing(
 
 
 def _join_phases(
-    stage: Stage, runs: Sequence[LoopRun], rest: Equilibrium | None, contacts: tuple[Contact, ...]
+    stage: Stage, runs: Sequence[LoopRun], start: Equilibrium | None, contacts: tuple[Contact, ...]
 ) -> Playback:
     names = channel_names(stage.plant)
     count = runs[0].current.shape[0]
@@ -265,7 +265,7 @@ def _join_phases(
         current=np.hstack([run.current for run in runs]),
         outputs={name: np.hstack([column(run, name) for run in runs]) for name in names},
         peaks={name: np.max([run.peaks[name] for run in runs if name in run.peaks], axis=0) for name in names},
-        rest=rest,
+        equilibrium=start,
         edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
         contacts=contacts,
         faulted=find_faults(stage.law, runs[-1].end.z),

@@ -163,8 +163,8 @@ class Scenario:
             return f"it applies to plants whose link is {self.on}"
         if any(phase.held for phase in self.phases) and partner is None:
             return "there is no plant with the same actuator and its link fixed"
-        held = partner if any(phase.held for phase in self.phases) else None
-        if self.friction == "sticking" and not all(can_hold(each) for each in (plant, held) if each is not None):
+        locked = partner if any(phase.held for phase in self.phases) else None
+        if self.friction == "sticking" and not all(can_hold(each) for each in (plant, locked) if each is not None):
             return "the plant has no friction that jumps at rest, or that has bristles"
         for name in (name for phase in self.phases for name in phase.scale):
             if name not in plant.parameters:
@@ -211,7 +211,7 @@ def default_scenarios(controller: Controller, plant: Plant, sets: Sequence[Param
     >>> [scenario.name for scenario in default_scenarios(controller, so.plants.high_impedance())]
     ['2 % step', '10 % step', '50 % step', 'unsaturated step', 'saturating doublet', 'saturating hold', 'chirp']
     """
-    step, rest = find_step_limit(controller), controller.force_limit(0.0)
+    step, holding = find_step_limit(controller), controller.force_limit(0.0)
     band = controller.spec.bandwidth_hz
     small = 0.5 * step if step is not None else NOMINAL_EFFORT[controller.command.mechanics]
     tail, lasting = _size_last_phase(controller, plant), max(0.2, 6.0 / band)
@@ -221,14 +221,17 @@ def default_scenarios(controller: Controller, plant: Plant, sets: Sequence[Param
         scenarios.append(Scenario(name=name, phases=phases, **limits))
 
     end = Phase(duration_s=tail)
-    if step is not None and rest is not None:
+    if step is not None and holding is not None:
         half = 1.5 / band
         there, back = (Phase(duration_s=half, force_N=force) for force in (4.0 * step, -4.0 * step))
         add(DOUBLET, there, back, end)
         # More than the limit holds, then a quarter: an integrator that has wound up overshoots. The force that the
         # limit can hold does not depend on where the plant rests.
-        more, quarter = Phase(duration_s=2 * lasting, force_N=1.2 * rest), Phase(duration_s=tail, force_N=0.25 * rest)
-        add(HOLD, more, quarter, about_rest=False, final_error=0.005 * rest, on="held")
+        more, quarter = (
+            Phase(duration_s=2 * lasting, force_N=1.2 * holding),
+            Phase(duration_s=tail, force_N=0.25 * holding),
+        )
+        add(HOLD, more, quarter, about_rest=False, final_error=0.005 * holding, on="held")
     limit = controller.force_limit(float(band))
     sweep = Chirp(amplitude=0.5 * limit if limit is not None else small, f0_hz=band / 5, f1_hz=1.5 * band)
     add("chirp", Phase(duration_s=2.0, excitation=(sweep,)), end)
@@ -320,9 +323,9 @@ def _stick(controller: Controller, step: Scenario, friction: float) -> Scenario:
 
 def _size_steps(controller: Controller) -> dict[str, float]:
     """Return the forces (N) of steps by name."""
-    limit, rest = find_step_limit(controller), controller.force_limit(0.0)
-    if limit is not None and rest is not None:
-        shares = {f"{100 * share:g} % step": share * rest for share in STEP_SHARES}
+    limit, holding = find_step_limit(controller), controller.force_limit(0.0)
+    if limit is not None and holding is not None:
+        shares = {f"{100 * share:g} % step": share * holding for share in STEP_SHARES}
         return shares | {"unsaturated step": UNSATURATED * limit}
     plant, params = _require_design(controller)
     friction = sum(find_dry_friction(plant, plant.complete(params)).values())
@@ -355,9 +358,11 @@ def find_step_limit(controller: Controller) -> float | None:
     )
     tried = NOMINAL_EFFORT[controller.command.mechanics]
     run = run_loop(loop, [params], np.full(_count_samples(controller, 0.2), tried))
-    step, held = tried * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.0)
-    assert held is not None
-    return step if step > LEAST_STEP * held else held  # with play it may run away where the loop at rest is stable
+    step, holding = tried * limit / float(np.max(np.abs(run.current))), controller.force_limit(0.0)
+    assert holding is not None
+    return (
+        step if step > LEAST_STEP * holding else holding
+    )  # with play it may run away where the loop at rest is stable
 
 
 def build_loop(

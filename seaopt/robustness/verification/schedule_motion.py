@@ -98,12 +98,12 @@ class _Pushing:
         for _ in range(TRIES):
             try:
                 run = self.start.run(self.plant, self.start.params, size * self.pushes[None])
-                place = self.follow(run)
+                path = self.follow(run)
                 push = _Push(
                     size=size,
                     run=run,
-                    rate=float(np.max(np.abs(np.diff(place)))) / self.schedule.spec.sample_time_s,
-                    room=float(np.max(np.abs(place - self.middle))) / self.room,
+                    rate=float(np.max(np.abs(np.diff(path)))) / self.schedule.spec.sample_time_s,
+                    room=float(np.max(np.abs(path - self.middle))) / self.room,
                     command=float(np.max(np.abs(run.current))) / limit,
                 )
                 share = max(NEAR * push.rate / rate, push.room, push.command)
@@ -138,8 +138,8 @@ def move_schedule(
         return Motion(plant=name, asked=rate, rate=0.0, size=0.0, fault=fault, **middle, **lost)
     if push.rate < rate:
         pushing, push, loss = _change_length(pushing, push, loss, rate)
-    place, size = pushing.follow(push.run), push.size
-    left, ringing = pushing.measure(pushing.start.find_errors(push.run, place)[0] / size)
+    path, size = pushing.follow(push.run), push.size
+    left, ringing = pushing.measure(pushing.start.find_errors(push.run, path)[0] / size)
     standing = [
         pushing.measure(loop.simulate(pushing.pushes)[0] - pushing.pushes)
         for loop in schedule.close_points(plant, params)
@@ -157,8 +157,8 @@ def move_schedule(
         plant=name,
         asked=rate,
         rate=push.rate,
-        low=float(np.min(place)),
-        high=float(np.max(place)),
+        low=float(np.min(path)),
+        high=float(np.max(path)),
         size=size,
         left=left,
         ringing=ringing,

@@ -195,7 +195,7 @@ def _run_sweep(
     omega = 2.0 * math.pi * frequency_hz
     count = max(LEAST_PULSES, math.ceil(1.0 / frequency_hz / (2 * pulses.samples * ts)))
     pulse = np.tile(np.repeat([1.0, 0.0], pulses.samples), count)
-    place = low + 0.5 * (high - low) * (1.0 - np.cos(omega * ts * np.arange(pulse.size)))
+    path = low + 0.5 * (high - low) * (1.0 - np.cos(omega * ts * np.arange(pulse.size)))
     start = RestStart.at_rest(schedule, plant, params, low)
     values = start.params.with_parameters(
         *(
@@ -205,10 +205,10 @@ def _run_sweep(
     )
     make_sweep = partial(Sweep, plant=name, rate=0.5 * (high - low) * omega, frequency_hz=frequency_hz)
     try:
-        run = start.run(make_swept_plant(plant, schedule.over), values, np.outer([0.0, pulses.size], pulse), place)
+        run = start.run(make_swept_plant(plant, schedule.over), values, np.outer([0.0, pulses.size], pulse), path)
     except SimulationError as error:
         return make_sweep(peak=math.inf, left=math.inf, fault=f"is lost: {error}")
-    calm, moved = start.find_errors(run, place)
+    calm, moved = start.find_errors(run, path)
     response = (moved - calm) / pulses.size + pulse
     peak = float(max(np.max(response), 1.0 - np.min(response)))
     ends = range(pulses.samples, pulse.size + 1, pulses.samples)
@@ -271,9 +271,9 @@ class RestStart:
         reference = float(fed[0]) - _weigh(law, named, value)
         given = reference + references
         if law.outer is not None:
-            place, _ = law.outer.split(self.readings.get(law.outer.position, 0.0))
+            x_0, _ = law.outer.split(self.readings.get(law.outer.position, 0.0))
             travelled, _ = law.outer.split(_travel(plant, law.outer, values, references.shape[1]))
-            reference = reference / law.outer.per_given + place
+            reference = reference / law.outer.per_given + x_0
             given = reference + references / law.outer.per_given + travelled
         kept = list_kept(law, law.reset(reference, fed, value, self.command, readings=further))
         x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]
@@ -297,7 +297,7 @@ class RestStart:
         name = law.compensation.gravity.reads
         read = run.outputs.get(name, np.zeros_like(errors))
         rows = [
-            [_weigh(law, {name: position}, place) for position, place in zip(row, places.tolist(), strict=True)]
+            [_weigh(law, {name: position}, value) for position, value in zip(row, places.tolist(), strict=True)]
             for row in read.tolist()
         ]
         return errors - np.array(rows)
@@ -315,12 +315,12 @@ def _travel(plant: Plant, outer: OuterLoop, values: ParameterSet, samples: int) 
     return path - path[0]
 
 
-def _weigh(law: RunnableSchedule, readings: Mapping[str, float], place: float) -> float:
+def _weigh(law: RunnableSchedule, readings: Mapping[str, float], value: float) -> float:
     """Return what a law adds to its reference at readings, those that are missing at zero."""
     if law.compensation is None:
         return 0.0
     read = [readings.get(name, 0.0) for name in law.compensation.reads]
-    return law.compensation.step(FORGOTTEN, 0.0, read, law.find_terms(place))[0]
+    return law.compensation.step(FORGOTTEN, 0.0, read, law.find_terms(value))[0]
 
 
 @memo

@@ -113,8 +113,8 @@ class Verification(Result, Worded):
             return []
         devices, same = ((each.sensors, each.command_step) for each in (self.stages[name], stage))
         same_draws = list(map(id, self.draws[name])) == list(map(id, draws))
-        held = any(phase.held for phase in scenario.phases)  # by a partner, which may be another one
-        if held or devices != same or self.seed != seed or not same_draws or scenario not in self.scenarios[name]:
+        locked = any(phase.held for phase in scenario.phases)  # by a partner, which may be another one
+        if locked or devices != same or self.seed != seed or not same_draws or scenario not in self.scenarios[name]:
             return []
         return [row for row in self.rows if (row.plant, row.scenario) == (name, scenario.name)]
 

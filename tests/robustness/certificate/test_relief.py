@@ -31,7 +31,7 @@ def force():
 @pytest.fixture(scope="module")
 def look():
     return partial(
-        look_at_draws, plants={"knee": KNEE}, parameters=VALUES, ranges={"m": MASSES}, others=so.ParameterSet()
+        look_at_draws, plants={"knee": KNEE}, parameters=VALUES, ranges={"m": MASSES}, supplement=so.ParameterSet()
     )
 
 

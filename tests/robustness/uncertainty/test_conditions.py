@@ -138,7 +138,7 @@ def test_nothing_moves_until_something_happens(controller, proportional, swing, 
         trace = play(Stage(controller=law, plant=swing), still, [at(thor, phi=0.9, delay_s=0.2e-3), thor])
         assert np.ptp(trace.outputs["phi"][0]) < 1e-9
         assert np.ptp(trace.current[0]) < 1e-7
-        assert trace.rest.force == pytest.approx([resting_by_hand(thor, 0.9)[1], 0.0], rel=1e-9)
+        assert trace.equilibrium.force == pytest.approx([resting_by_hand(thor, 0.9)[1], 0.0], rel=1e-9)
         assert not np.any(trace.current[1])
 
 
@@ -154,7 +154,7 @@ def test_small_steps_there_are_the_linear_loops(controller, swing, thor):
         forces.append(float(c @ x))
         x = a @ x + b * law(0.05, forces[-1]) / controller.command.per_effort
     assert d == 0.0
-    np.testing.assert_allclose(trace.outputs["F1"][0] - trace.rest.force[0], forces, atol=3e-5)
+    np.testing.assert_allclose(trace.outputs["F1"][0] - trace.equilibrium.force[0], forces, atol=3e-5)
 
 
 def test_the_fall_is_dop853s_and_its_energy_is_the_work_done(controller, swing, thor):

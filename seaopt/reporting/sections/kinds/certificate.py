@@ -226,12 +226,12 @@ def _tabulate_places(certificate: Certificate, schedule: ScheduledController) ->
         (
             f"{value:.4g}",
             "point" if value in schedule.points else "between",
-            f"{max(figures.ms for figures in place.plants.values()):.3f}",
-            f"{max(figures.mt for figures in place.plants.values()):.3f}",
-            f"{max(case.ms for case in place.worst.values()):.3f}",
-            f"{place.monte_carlo.failures} of {place.monte_carlo.samples}",
+            f"{max(figures.ms for figures in each.plants.values()):.3f}",
+            f"{max(figures.mt for figures in each.plants.values()):.3f}",
+            f"{max(case.ms for case in each.worst.values()):.3f}",
+            f"{each.monte_carlo.failures} of {each.monte_carlo.samples}",
         )
-        for value, place in zip(certificate.values, certificate.places, strict=True)
+        for value, each in zip(certificate.values, certificate.places, strict=True)
     )
     head = (f"{schedule.over}{unit_after(schedule.unit)}", "", "Ms", "Mt", "worst Ms", "draws that fail")
     return Section(

@@ -84,28 +84,28 @@ def explain_sliding(controller: Controller) -> Iterator[str]:
 
 def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[Step, ...]:
     """Return the line of the file with a bandwidth that is possible, or how to look for what is."""
-    possible, asked = controller.possible, controller.spec.bandwidth_hz
+    possible, wanted_hz = controller.possible, controller.spec.bandwidth_hz
     if possible is None:
-        return (show_costs(asked, commands),)
+        return (show_costs(wanted_hz, commands),)
     first = Step(text=str(possible))
     if possible.nearest_hz:
-        nearest = min(possible.nearest_hz, key=lambda hz: abs(hz - asked))
-        return (first, show_costs(asked, commands, first=f"bandwidth_hz = {nearest:.4g} in [controller], or "))
+        nearest = min(possible.nearest_hz, key=lambda hz: abs(hz - wanted_hz))
+        return (first, show_costs(wanted_hz, commands, first=f"bandwidth_hz = {nearest:.4g} in [controller], or "))
     unstable = any(name.startswith("stability") for name in controller.active_constraints)
     easing = "" if unstable else advise_easing(controller.active_constraints)  # figures of no stable law bind nothing
-    return (first, show_costs(asked, commands, first=f"{easing} in [controller]; " if easing else ""))
+    return (first, show_costs(wanted_hz, commands, first=f"{easing} in [controller]; " if easing else ""))
 
 
-def show_costs(asked: float, commands: Commands, *, first: str = "") -> Step:
+def show_costs(bandwidth_hz: float, commands: Commands, *, first: str = "") -> Step:
     """Return how to see what bandwidths about one cost; `first`: what to try before."""
     text = f"{first}to see what other bandwidths cost"
     if not commands.tune:
         return Step(text=f"{text} call seaopt.control.sweep")
-    return Step.typed(text, f"{commands.sweep} {_choose_range(asked)}")
+    return Step.typed(text, f"{commands.sweep} {_choose_range(bandwidth_hz)}")
 
 
-def _choose_range(asked: float) -> str:
-    low, high = (factor * asked for factor in SWEEP_SPREAD)
+def _choose_range(bandwidth_hz: float) -> str:
+    low, high = (factor * bandwidth_hz for factor in SWEEP_SPREAD)
     step = max(float(f"{(high - low) / 6:.1g}"), 0.1)
     return f"{step * math.floor(low / step):.4g}:{step * math.ceil(high / step):.4g}:{step:.4g}"
 
@@ -114,11 +114,11 @@ def summarise(controller: Controller) -> list[KeyFigure]:
     """Return bandwidth and margins on the design plant."""
     achieved, spec, on = controller.achieved, controller.spec, "design plant"
     ms, gain_unit = spec.level("max_sensitivity"), controller.command.gain_unit
-    asked, allowed = f"asked {spec.bandwidth_hz:g} Hz", "" if ms is None else f"at most {ms:g}"
+    against, allowed = f"asked {spec.bandwidth_hz:g} Hz", "" if ms is None else f"at most {ms:g}"
     if stuck := show_stuck_bandwidth(controller):
-        asked = f"{stuck} Hz stuck, {asked}"
+        against = f"{stuck} Hz stuck, {against}"
     return [
-        KeyFigure(name="bandwidth", value=_say_sliding(controller, achieved.bandwidth_hz), against=asked),
+        KeyFigure(name="bandwidth", value=_say_sliding(controller, achieved.bandwidth_hz), against=against),
         KeyFigure(name="Ms", value=format_number(achieved.ms, 3), against=allowed),
         KeyFigure(name="phase margin", value=format_figure(achieved.phase_margin_deg, "deg", 3), against=on),
         KeyFigure(name="noise gain", value=format_figure(achieved.noise_gain, gain_unit, 3), against=on),
@@ -221,8 +221,8 @@ def _describe_friction(controller: Controller) -> Iterator[str]:
     if controller.design is None:
         return
     if controller.friction is not None:
-        loop, asked = controller.design_loop, controller.spec.level("min_friction_margin")
-        limit = "" if asked is None else f" (asked {asked:g})"
+        loop, least = controller.design_loop, controller.spec.level("min_friction_margin")
+        limit = "" if least is None else f" (asked {least:g})"
         slope = f"{format_number(loop.friction_slope)} {loop.slope_unit}"
         yield f"Friction margin {slope}{limit}: {controller.friction.describe()}."
     yield from explain_sliding(controller)

@@ -173,9 +173,9 @@ def _find_own_value(log: LogValues, parameter: str) -> tuple[str, str]:
 
 
 def _tabulate_figure(name: str, figure: DerivedFigure, remark: str) -> tuple[str, ...]:
-    interval, known = (_interval(figure.ci95), _known(figure.known)) if figure.total_std else ("", "")
+    interval, percent = (_interval(figure.ci95), _known(figure.known)) if figure.total_std else ("", "")
     stds = (_spread(figure.std), _spread(figure.model_std))
-    return (name, f"{figure.value:.6g}", *stds, interval, known, _unit(figure.unit), remark, "")
+    return (name, f"{figure.value:.6g}", *stds, interval, percent, _unit(figure.unit), remark, "")
 
 
 def _describe_outputs(fit: Fit) -> Iterator[Section]:
@@ -258,10 +258,10 @@ def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[Step]
             continue
         if name in trials and name not in fit.parameters:
             added.update(dict.fromkeys(trials[name].parts))
-            place, rows = PARAMETERS, spell_parameters(trials[name].frees, trials[name].fixed)
+            table, rows = PARAMETERS, spell_parameters(trials[name].frees, trials[name].fixed)
         else:
-            place, *rows = spell_cure(name, value) or [PARAMETERS]
-        places.setdefault(place, {}).update(dict.fromkeys(rows))
+            table, *rows = spell_cure(name, value) or [PARAMETERS]
+        places.setdefault(table, {}).update(dict.fromkeys(rows))
     if not plants:
         recipes = [experiment.plant.recipe for experiment in fit.experiments[:1]]
         plants = {NAME: [part for recipe in recipes if recipe is not None for part in recipe.parts]}
@@ -270,13 +270,13 @@ def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[Step]
         rows += spell_parts((*parts, *added)) if added else []
         if rows:
             yield _write_under(f"[plant.{name}]", rows)
-    for place, lines in places.items():
+    for table, lines in places.items():
         if lines:
-            yield _write_under(place, lines)
+            yield _write_under(table, lines)
 
 
-def _write_under(place: str, rows: Iterable[str]) -> Step:
-    return Step(text=f"write under {place}, in place of a line of that name if there is one:", copied=tuple(rows))
+def _write_under(table: str, rows: Iterable[str]) -> Step:
+    return Step(text=f"write under {table}, in place of a line of that name if there is one:", copied=tuple(rows))
 
 
 def spell_cure(name: str, value: float) -> list[str]:

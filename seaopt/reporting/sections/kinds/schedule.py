@@ -65,13 +65,13 @@ def describe(schedule: ScheduledController) -> list[Section]:
 
 
 def _describe_between(schedule: ScheduledController) -> str:
-    bands = [place.bandwidth_hz or 0.0 for place in schedule.between]
+    bands = [figures.bandwidth_hz or 0.0 for figures in schedule.between]
     if not bands:
         return "Nothing was computed between the points."
     return (
         f"Between the points, at {format_count(len(bands), 'value')}: bandwidth {min(bands):.4g} to {max(bands):.4g} "
-        f"Hz, Ms up to {max(place.ms for place in schedule.between):.3f}, Mt up to "
-        f"{max(place.mt for place in schedule.between):.3f}."
+        f"Hz, Ms up to {max(figures.ms for figures in schedule.between):.3f}, Mt up to "
+        f"{max(figures.mt for figures in schedule.between):.3f}."
     )
 
 

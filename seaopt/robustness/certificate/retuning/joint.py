@@ -223,14 +223,14 @@ def tune_certified(
     fitted = settled.parameters if isinstance(settled, Fit) else settled
     values = (others or ParameterSet()).with_parameters(*fitted.values())
     witnesses = {name: (other, values) for name, other in plants.items() if other is not plant} | dict(robust_to or {})
-    share, asked = 1.0 - (1.0 - confidence) / rounds, spec
+    share, stated = 1.0 - (1.0 - confidence) / rounds, spec
     outer = None if complete is None else lambda law: complete(law).outer
 
     def tune_at(bandwidth_hz: float) -> Controller:
-        law = tune(plant, values, replace(asked, bandwidth_hz=bandwidth_hz), robust_to, draws=draws, outer=outer)
+        law = tune(plant, values, replace(stated, bandwidth_hz=bandwidth_hz), robust_to, draws=draws, outer=outer)
         return (law if complete is None else complete(law)).with_model
 
-    drawn = {"parameters": parameters, "ranges": ranges or {}, "others": others or ParameterSet()}
+    drawn = {"parameters": parameters, "ranges": ranges or {}, "supplement": others or ParameterSet()}
     look = partial(look_at_draws, plants=plants, **drawn)
     finished: list[Round] = []
     strained: Controller | None = None  # the first law that what it feeds back besides takes beyond a limit at draws
@@ -292,9 +292,9 @@ def tune_certified(
 def _list_over(certificate: Certificate) -> list[Look]:
     """Return the worst cases that break a limit, beside what the law alone uses there."""
     looks = (
-        Look.of_law(place.controller, case)
-        for place in certificate.places or (certificate,)
-        for case in place.worst.values()
+        Look.of_law(part.controller, case)
+        for part in certificate.places or (certificate,)
+        for case in part.worst.values()
     )
     return [each for each in looks if each.is_over]
 
@@ -318,9 +318,9 @@ def _list_new_witnesses(
                 values = place_values(plant, each.parameters, draws.parameters)
                 cases[f"{name}'s friction"] = (plant, values, draws.parameters)
     return {
-        f"{name}, round {number}: {format_values(place, missing='nominal')}": (plant, values)
-        for name, (plant, values, place) in cases.items()
-        if not any(plant is other and _agree(values, at, place) for other, at in tuned_on)
+        f"{name}, round {number}: {format_values(drawn, missing='nominal')}": (plant, values)
+        for name, (plant, values, drawn) in cases.items()
+        if not any(plant is other and _agree(values, at, drawn) for other, at in tuned_on)
     }
 
 
@@ -338,5 +338,5 @@ def _list_cells(entry: Round) -> tuple[str, str, str, str]:
         return str(entry.number), str(entry.plants), "–", "limits not met on these plants"
     name, worst = max(entry.certificate.worst.items(), key=lambda pair: pair[1].severity)
     size = "unstable" if worst.severity >= UNSTABLE else f"{worst.severity:.4f}"
-    failures, place = str(entry.certificate.monte_carlo.failures), format_values(worst.parameters, missing="nominal")
-    return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {place}"
+    failures, values = str(entry.certificate.monte_carlo.failures), format_values(worst.parameters, missing="nominal")
+    return str(entry.number), str(entry.plants), failures, f"{size} on {name} at {values}"

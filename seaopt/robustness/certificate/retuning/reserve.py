@@ -97,12 +97,12 @@ class _Aim:
 
 
 def look_at_draws(
-    law: Controller | ScheduledController, plants: Plants, parameters: Source, ranges: Ranges, others: ParameterSet
+    law: Controller | ScheduledController, plants: Plants, parameters: Source, ranges: Ranges, supplement: ParameterSet
 ) -> dict[str, Look]:
     """Return of each plant the worst case that a few of `certify`'s draws and searches from them find, at the value of
     a schedule where it is worst; none where nothing is uncertain.
     """
-    posed = pose(law, plants, parameters, ranges, others)
+    posed = pose(law, plants, parameters, ranges, supplement)
     first, *_ = cases = list(posed.values())
     if not first.unknown.size:
         return {}
@@ -157,7 +157,7 @@ def keep_reserve(
             return schedule
         looks = look(schedule)
         over = {name: each for name, each in looks.items() if each.is_over}
-        broken = any(place.broken for place in schedule.between)
+        broken = any(figures.broken for figures in schedule.between)
         missed = max((each.worst.severity for each in over.values()), default=0.0) + UNSTABLE * broken
         if missed >= least:
             break
