@@ -125,7 +125,8 @@ def check_distinct(channels: Mapping[str, tuple[tuple[str, str], str]]) -> list[
             if other_unit == unit:
                 raise LogError(
                     f'{column[0]}: column "{column[1]}" is given for {other} and for {name}; each channel needs a '
-                    "column of its own: choose another for one of them, leave it out, or give a file's column shared = true"
+                    "column of its own: choose another for one of them, leave it out, or give a file's column "
+                    "shared = true"
                 )
             notes.append(
                 f'{other} and {name} are the same column "{column[1]}", in {other_unit or "-"} and in {unit or "-"}'

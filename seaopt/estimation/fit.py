@@ -175,12 +175,12 @@ def _go_on(problem: FitProblem, earlier: Fit, method: Method, callback: Callback
     by_plant = {each.plant: each for each in earlier.nuisance.values()}
     for experiment in problem.experiments:
         name, plant = experiment.name, experiment.data.plant.name
-        known = earlier.nuisance.get(name, by_plant.get(plant))
-        if known is None:
+        nuisance = earlier.nuisance.get(name, by_plant.get(plant))
+        if nuisance is None:
             continue
-        values[f"{name}.delay_s"] = known.delay_s
-        values |= {f"{name}.gain.{output}": gain for output, gain in known.gain.items()}
-        for number, states in enumerate(known.initial_state if name in earlier.nuisance else ()):
+        values[f"{name}.delay_s"] = nuisance.delay_s
+        values |= {f"{name}.gain.{output}": gain for output, gain in nuisance.gain.items()}
+        for number, states in enumerate(nuisance.initial_state if name in earlier.nuisance else ()):
             label = f"{name}.initial{number + 1 if number else ''}"
             values |= {f"{label}.{state}": value for state, value in states.items()}
     unknowns = problem.unknowns

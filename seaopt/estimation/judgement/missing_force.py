@@ -64,9 +64,9 @@ def find_missing_force(experiment: FitExperiment, params: ParameterSet, rows: sl
     if np.count_nonzero(there) < FEWEST_READ:
         return None
     position, speed, force = x[state][there], x[rates[state]][there], force[there]
-    others = np.column_stack([np.ones(force.size), np.sign(speed), states.T[there], u.T[there]])
-    others /= np.maximum(np.max(np.abs(others), axis=0), 1e-300)
-    force -= others @ np.linalg.lstsq(others, force, rcond=1e-9)[0]
+    regressors = np.column_stack([np.ones(force.size), np.sign(speed), states.T[there], u.T[there]])
+    regressors /= np.maximum(np.max(np.abs(regressors), axis=0), 1e-300)
+    force -= regressors @ np.linalg.lstsq(regressors, force, rcond=1e-9)[0]
     return MissingForce(state=state, position=position, speed=speed, force=force) if np.ptp(position) else None
 
 

@@ -78,21 +78,21 @@ class LaggedSums:
     def __init__(self, rows: int, longest: int, lags: int) -> None:
         self.lags, self.size = lags, find_quick_size(longest + lags)
         lines = self.size // 2 + 1
-        self.own = np.zeros((rows, 2 * lines))  # squares of real and imaginary parts, side by side
+        self.power = np.zeros((rows, 2 * lines))  # squares of real and imaginary parts, side by side
         self.cross = {(a, b): np.zeros(lines, dtype=complex) for a in range(rows) for b in range(a)}
 
     def add(self, x: Float[np.ndarray, "rows n"]) -> None:
         """Add a part."""
         spectrum = np.fft.rfft(x, self.size)
-        self.own += np.square(spectrum.view(float))
+        self.power += np.square(spectrum.view(float))
         for (a, b), total in self.cross.items():
             total += spectrum[a] * np.conj(spectrum[b])
 
     def sums(self) -> Float[np.ndarray, "lags1 rows rows"]:
         """Return the sums by lag."""
-        rows, count = len(self.own), self.lags + 1
+        rows, count = len(self.power), self.lags + 1
         sums = np.empty((count, rows, rows))
-        power = np.sum(self.own.reshape(rows, -1, 2), axis=2)
+        power = np.sum(self.power.reshape(rows, -1, 2), axis=2)
         for a, auto in enumerate(np.fft.irfft(power, self.size)):
             sums[:, a, a] = auto[:count]
         for (a, b), total in self.cross.items():

@@ -221,12 +221,12 @@ class FitExperiment:
         free, delays = wider.model.free, [point.clock.delay_free, other.clock.delay_free]
         columns = [0, *(1 + free.index(name) for name in self.model.free), *([1 + len(free)] if delays[0] else [])]
         for segment, larger in zip(self.segments, wider.segments, strict=True):
-            own = range(1 + len(free) + delays[1], 1 + len(larger.columns[0]))
-            asked, more = (
+            of_outputs = range(1 + len(free) + delays[1], 1 + len(larger.columns[0]))
+            smaller, more = (
                 (each.model, part.samples, where, part.start(unknowns), each.weights)
                 for each, part, where, unknowns in ((self, segment, point, z), (wider, larger, other, at))
             )
-            keep_part(asked, more, [*columns, *own])
+            keep_part(smaller, more, [*columns, *of_outputs])
 
     def run_all(self, z: Vector, *, keep: bool = False) -> tuple[Pass, ...]:
         """Run the pass of every segment; those of a nonlinear plant keep the outputs of the first samples. `keep`: all

@@ -162,7 +162,7 @@ class _Arrow:
     shape: ArrowShape
     blocks: tuple[_Spectrum, ...]
     across: tuple[Float[np.ndarray, "..."], ...]
-    rest: _Spectrum
+    remainder: _Spectrum
 
     @classmethod
     def of(cls, matrix: Matrix, shape: ArrowShape, cut: float) -> _Arrow:
@@ -176,27 +176,29 @@ class _Arrow:
             across.append(blocks[-1].solve(beside))
             reduced -= np.einsum("bkp,bkq->pq", beside, across[-1])
         largest = float(np.max(np.linalg.eigvalsh(shaft), initial=1e-300))
-        return cls(shape=shape, blocks=tuple(blocks), across=tuple(across), rest=_Spectrum.of(reduced, cut, largest))
+        return cls(
+            shape=shape, blocks=tuple(blocks), across=tuple(across), remainder=_Spectrum.of(reduced, cut, largest)
+        )
 
     def solve(self, right: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
         solution = np.empty_like(right)
         shaft = right[self.shape.shaft].copy()
         for rows, across in zip(self.shape.blocks, self.across, strict=True):
             shaft -= np.einsum("bkq,bkm->qm", across, right[rows])
-        solution[self.shape.shaft] = shaft = self.rest.solve(shaft)
+        solution[self.shape.shaft] = shaft = self.remainder.solve(shaft)
         for rows, block, across in zip(self.shape.blocks, self.blocks, self.across, strict=True):
             solution[rows] = block.solve(right[rows]) - across @ shaft
         return solution
 
     def invert(self) -> Matrix:
         every = self._extend(np.eye(self.shape.shaft.size))
-        inverse = every @ self.rest.solve(every.T)
+        inverse = every @ self.remainder.solve(every.T)
         for rows, block in zip(self.shape.blocks, self.blocks, strict=True):
             inverse[rows[:, :, None], rows[:, None, :]] += block.invert()
         return inverse
 
     def unseen(self) -> Vector:
-        null = self._extend(self.rest.vectors[:, ~self.rest.seen])
+        null = self._extend(self.remainder.vectors[:, ~self.remainder.seen])
         unseen = np.sum(null**2 / np.maximum(np.sum(null**2, axis=0), 1e-300), axis=1)
         for rows, block in zip(self.shape.blocks, self.blocks, strict=True):
             unseen[rows] += block.unseen()

@@ -135,7 +135,7 @@ class _Builder:
     def take_start(self, experiment: Experiment, model: Model) -> Vector:
         """Return the first values of a model's free parameters."""
         places = find_places(experiment, model, [entry.name for entry in self.entries])
-        return np.array([self.entries[place].value for place in places])
+        return np.array([self.entries[index].value for index in places])
 
 
 def collect(
