@@ -27,7 +27,7 @@ ORDER = (  # of the commands in the help: as they are used
 )  # fmt: skip
 
 
-class _Commands(TyperGroup):
+class _OrderedCommands(TyperGroup):
     """The commands, in the order of their use; Ctrl-C is one line on stderr and exit code 130."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -53,7 +53,7 @@ class _Commands(TyperGroup):
 
 app = typer.Typer(
     name="seaopt",
-    cls=_Commands,
+    cls=_OrderedCommands,
     help="Series elastic actuators: from raw bench logs to a certified force controller.",
     pretty_exceptions_enable=False,
 )

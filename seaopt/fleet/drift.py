@@ -189,7 +189,7 @@ class Drift(Worded):
 
 
 @record(eq=False)
-class _Runs:
+class _RunTable:
     """Runs of one parameter: a row per actuator, a column per run, nan where there is none."""
 
     actuators: list[str]
@@ -310,7 +310,7 @@ def find_drift(
     )
 
 
-def _shape(batches: Sequence[_Runs], between: Between, threshold: float) -> Between:
+def _shape(batches: Sequence[_RunTable], between: Between, threshold: float) -> Between:
     """Return the same with tails, of the innovations until what led to an alarm; of some actuators of many."""
     step = -(-sum(batch.values.size for batch in batches) // (2 * MOST_OF_TAILS))
     ratios: list[VectorN] = []
@@ -389,7 +389,7 @@ def _explain_missing(history: History, rows: pl.DataFrame) -> str:
     return f"fewer than {FEWEST_PAIRS} times one log of an actuator follows another ({hint})"
 
 
-def _batch_runs(rows: pl.DataFrame, name: str) -> Iterator[_Runs]:
+def _batch_runs(rows: pl.DataFrame, name: str) -> Iterator[_RunTable]:
     """Yield the runs of a parameter, some actuators at once, those of about as many runs together."""
     numbered = rows.with_columns(pl.int_range(pl.len()).over(LABEL).alias(_RUN))
     counts = numbered.group_by(LABEL, maintain_order=True).len().sort("len", maintain_order=True)
@@ -401,7 +401,7 @@ def _batch_runs(rows: pl.DataFrame, name: str) -> Iterator[_Runs]:
         batch.append(label)
 
 
-def _pack(rows: pl.DataFrame, actuators: list[str], name: str) -> _Runs:
+def _pack(rows: pl.DataFrame, actuators: list[str], name: str) -> _RunTable:
     """Return runs as arrays."""
     index = {label: row for row, label in enumerate(actuators)}
     at = np.array([index[label] for label in rows[LABEL]]), rows[_RUN].to_numpy()
@@ -409,10 +409,12 @@ def _pack(rows: pl.DataFrame, actuators: list[str], name: str) -> _Runs:
     places, times, values, variances = np.full(shape, -1), *(np.full(shape, np.nan) for _ in range(3))
     places[at], times[at] = rows[_PLACE].to_numpy(), rows[TIME].to_numpy()
     values[at], variances[at] = rows[name].to_numpy(), rows[f"{name}_std"].to_numpy() ** 2
-    return _Runs(actuators=actuators, places=places, times=times, values=values, variances=variances)
+    return _RunTable(actuators=actuators, places=places, times=times, values=values, variances=variances)
 
 
-def _tabulate(batch: _Runs, name: str, unit: str, spread: Between, charts: Charts, threshold: float) -> pl.DataFrame:
+def _tabulate(
+    batch: _RunTable, name: str, unit: str, spread: Between, charts: Charts, threshold: float
+) -> pl.DataFrame:
     """Return the rows of a parameter in the table of trends."""
     with np.errstate(invalid="ignore", divide="ignore"):
         weights = np.nan_to_num(1.0 / (batch.variances + spread.std**2))
@@ -452,7 +454,7 @@ def _tabulate(batch: _Runs, name: str, unit: str, spread: Between, charts: Chart
 
 
 def _list_alarms(
-    batch: _Runs, history: History, name: str, unit: str, spread: Between, charts: Charts, threshold: float
+    batch: _RunTable, history: History, name: str, unit: str, spread: Between, charts: Charts, threshold: float
 ) -> list[Alarm]:
     """Return the alarms of a parameter."""
     alarms: list[Alarm] = []

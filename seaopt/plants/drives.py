@@ -74,7 +74,7 @@ _Solved = tuple[Any, Mapping[str, Any], Mapping[str, Any]]
 
 
 @record(eq=False)
-class _Drive:
+class _DriveEquations:
     """A drive ahead of a plant's first input: its own input, states and outputs with units, and its equations. `solve`
     is (t, x, u, p) -> (what the plant's input is, {state: rate}, {output: value}).
     """
@@ -127,7 +127,7 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
     unit_of_current = plant.inputs[current]
     return _put_before(
         plant,
-        _Drive(
+        _DriveEquations(
             name=part,
             input=name,
             unit=unit,
@@ -182,7 +182,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     unit = plant.outputs.get(position) or plant.states[position]
     return _put_before(
         plant,
-        _Drive(
+        _DriveEquations(
             name="position_servo",
             input="goal",
             unit=unit,
@@ -196,7 +196,7 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     )
 
 
-def _put_before(plant: Plant, drive: _Drive, ports: tuple[Port, ...]) -> Plant:
+def _put_before(plant: Plant, drive: _DriveEquations, ports: tuple[Port, ...]) -> Plant:
     """Return a plant behind a drive, with ports whose plants are behind it, too."""
     source = next(iter(plant.inputs))
     refuse_clash(

@@ -113,7 +113,7 @@ class RippleFit:
 
 
 @record(eq=False)
-class _Solution:
+class _RippleSolution:
     """Coefficients of a regression, their covariance, and the std of what is left."""
 
     values: Float[np.ndarray, " p"]
@@ -277,7 +277,7 @@ def _regress(
     turns: Float[np.ndarray, " n"],
     cycles: Sequence[int],
     moves: Bool[np.ndarray, " n"],
-) -> _Solution:
+) -> _RippleSolution:
     """Return least squares of the samples that move, with the covariance of a coloured residual."""
     angles = 2.0 * np.pi * (turns % 1.0)
     columns = [*drag.values(), *(wave(n * angles) for n in cycles for wave in (np.cos, np.sin))]
@@ -299,7 +299,7 @@ def _regress(
     if count <= 2 * values.size:
         raise ControlError(f"{count} samples move, of {values.size} unknowns; log longer, or give fewer cycles")
     power = float(left @ left) / (count - values.size)
-    return _Solution(values=values, covariance=power * _sum_coloured(back.T, left), residual_std=math.sqrt(power))
+    return _RippleSolution(values=values, covariance=power * _sum_coloured(back.T, left), residual_std=math.sqrt(power))
 
 
 def _sum_coloured(influence: Rows, left: Float[np.ndarray, " n"]) -> Float[np.ndarray, "p p"]:
@@ -322,7 +322,7 @@ def _sum_coloured(influence: Rows, left: Float[np.ndarray, " n"]) -> Float[np.nd
     return (spectra.conj().T @ (spectra * (weights * density)[:, None])).real / size
 
 
-def _select(fit: _Solution, first: int, cycles: Sequence[int], source: str) -> list[int]:
+def _select(fit: _RippleSolution, first: int, cycles: Sequence[int], source: str) -> list[int]:
     """Return the harmonics that differ from chance, by Wald's test at 1 % over all of them."""
     chosen: list[int] = []
     for i, n in enumerate(cycles):

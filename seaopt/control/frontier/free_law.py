@@ -174,7 +174,7 @@ def bound_free_law(
     terms = _make_terms(plant, spec, stable, _add_rest(spec, f), functions)
     nodes, weights = _place_nodes(spec, f)
     integral = _Integral(terms=_make_terms(plant, spec, stable, nodes, functions), weights=weights)
-    answer = _Program(spec, terms, integral).solve()
+    answer = _LinearProgram(spec, terms, integral).solve()
     if isinstance(answer, str):
         return FreeLaw(status=answer, objective=spec.objective, functions=terms.basis.shape[1], frequencies=f.size)
     value, x = answer
@@ -241,7 +241,7 @@ def _orthogonalise(terms: _Terms) -> Float[np.ndarray, "n k"]:
     return turns[kept].T / sizes[kept] * np.sqrt(terms.f.size)
 
 
-class _Program:
+class _LinearProgram:
     """The linear program, and the cuts it has so far."""
 
     def __init__(self, spec: ControllerSpec, terms: _Terms, integral: _Integral) -> None:

@@ -129,7 +129,7 @@ def sweep(
         progress(f"{spec.structure} over {over}, {len(found)} bandwidths", 1.0)
         return Frontier(rows=tuple(row for row, _ in found), controllers=tuple(law for _, law in found), over=over)
     sliding, sliding_robust_to = slide_plants(plant, params, robust_to)
-    swept = _Sweep(
+    swept = _SweepTask(
         task=make_task(plant, params, specs[0], robust_to, draws),
         sliding=make_task(sliding, params, specs[0], sliding_robust_to, draws),
         design=(plant, params),
@@ -148,7 +148,7 @@ def sweep(
 
 
 @record(eq=False)
-class _Sweep:
+class _SweepTask:
     """What is tuned at every bandwidth, and on the sliding plants alone."""
 
     task: Task
@@ -175,7 +175,7 @@ class _Sweep:
 
 
 @record(eq=False)
-class _Solved:
+class _SolvedBandwidth:
     """The numbers of one bandwidth's law, its loops, its link's path, its outer loop, and what it is compared with."""
 
     x: LawNumbers
@@ -187,8 +187,8 @@ class _Solved:
 
 
 def _solve_chains(
-    swept: _Sweep, specs: Sequence[ControllerSpec], executor: Executor | None, progress: Progress
-) -> Iterator[_Solved]:
+    swept: _SweepTask, specs: Sequence[ControllerSpec], executor: Executor | None, progress: Progress
+) -> Iterator[_SolvedBandwidth]:
     """Yield the solution of each specification, in their order."""
     chains = [specs[k : k + CHAIN] for k in range(0, len(specs), CHAIN)]
     parts = divide(progress, *(float(len(chain)) for chain in chains))
@@ -202,11 +202,11 @@ def _solve_chains(
         yield from solved
 
 
-def _solve_part(swept: Shared[_Sweep], chain: Sequence[ControllerSpec]) -> list[_Solved]:
+def _solve_part(swept: Shared[_SweepTask], chain: Sequence[ControllerSpec]) -> list[_SolvedBandwidth]:
     return list(_solve_chain(swept.value, chain, ignore))
 
 
-def _solve_chain(swept: _Sweep, chain: Sequence[ControllerSpec], progress: Progress) -> Iterator[_Solved]:
+def _solve_chain(swept: _SweepTask, chain: Sequence[ControllerSpec], progress: Progress) -> Iterator[_SolvedBandwidth]:
     """Yield the solution of each specification; every one but the first also starts from the one before."""
     warm: tuple[LawNumbers, ...] = ()
     for point, part in zip(chain, divide(progress, *(1.0 for _ in chain)), strict=True):
@@ -223,7 +223,7 @@ def _solve_chain(swept: _Sweep, chain: Sequence[ControllerSpec], progress: Progr
         free = None
         if swept.free_law and isinstance(task.plants[0], DigitalPlant):
             free = bound_free_law(task.plants[0], point, [task.law_of(x).balanced()])
-        yield _Solved(x=x, loops=loops, link=task.link, outer=around, without_sticking=alone, free_law=free)
+        yield _SolvedBandwidth(x=x, loops=loops, link=task.link, outer=around, without_sticking=alone, free_law=free)
         warm = (x,)
 
 

@@ -114,7 +114,7 @@ class _Pid(_Strict):
         return make(**self.model_dump(exclude={"form"}, exclude_none=True), sample_time_s=sample_time_s)
 
 
-class _Command(BaseModel):
+class _CommandTable(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
     per_effort: Positive | None = None
 
@@ -140,7 +140,7 @@ class LawFile(_Strict):
     reference: FractionTable | None = None
     measurement: FractionTable | list[FractionTable] | None = None
     pid: _Pid | None = None
-    command: _Command = _Command()
+    command: _CommandTable = _CommandTable()
     spec: Any = None
     terms: Any = None
 

@@ -178,7 +178,7 @@ def _choose_points(task: Task, grid: Grid, x: LawNumbers) -> dict[str, Int[np.nd
     return chosen
 
 
-class _Points(NamedTuple):
+class _SymbolicPoints(NamedTuple):
     """Plants and law at some points, as expressions."""
 
     p: _Complex
@@ -228,7 +228,7 @@ def _build_program(
     v, t, slack = ca.MX.sym("v", 14), ca.MX.sym("t"), ca.MX.sym("slack")
     x = v * data["scale"]
 
-    def law(part: dict[str, Any]) -> _Points:
+    def law(part: dict[str, Any]) -> _SymbolicPoints:
         """Return plants and law at some points."""
         at = {name: _Complex(part[f"{name}_re"], part[f"{name}_im"]) for name in complex_data}
         series, integral, rate, more, ahead, low_pass = evaluate_terms(
@@ -249,7 +249,7 @@ def _build_program(
             loop = loop + (at["fixed"] - 1.0) + c_v * at["speed"]
         if moved:
             loop = loop + c_r * at["asked"]
-        return _Points(p=at["p"], c_y=c_y, c_r=c_r, c_v=c_v, loop=loop)
+        return _SymbolicPoints(p=at["p"], c_y=c_y, c_r=c_r, c_v=c_v, loop=loop)
 
     names = [f"{name}_{part}" for name in complex_data for part in ("re", "im")]
     p, c_y, c_r, c_v, open_loop = law({name: data[name][:n] for name in names})

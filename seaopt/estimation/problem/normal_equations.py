@@ -87,15 +87,15 @@ def eliminate(matrix: Matrix, p: int, cut: float = 1e-12) -> ParameterMatrix:
     return matrix[:p, :p] - matrix[:p, p:] @ solve_seen(matrix[p:, p:], matrix[p:, :p], cut)
 
 
-def _factor(matrix: Matrix, cut: float) -> tuple[Vector, _Spectrum | _Arrow]:
+def _factor(matrix: Matrix, cut: float) -> tuple[Vector, _Eigenspace | _Arrow]:
     """Return the scale of the unknowns, and the factors of the matrix scaled to a unit diagonal."""
     scale = np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
     shape, scaled = find_arrow(matrix), matrix / (scale[:, None] * scale)
-    return scale, _Spectrum.of(scaled, cut) if shape is None else _Arrow.of(scaled, shape, cut)
+    return scale, _Eigenspace.of(scaled, cut) if shape is None else _Arrow.of(scaled, shape, cut)
 
 
 @record(eq=False)
-class _Spectrum:
+class _Eigenspace:
     """The eigenvalues and eigenvectors that are seen, of matrices in a stack, and the eigenvectors that are not."""
 
     values: Float[np.ndarray, "... n"]
@@ -103,7 +103,7 @@ class _Spectrum:
     seen: Bool[np.ndarray, "... n"]
 
     @classmethod
-    def of(cls, matrix: Float[np.ndarray, "... n n"], cut: float, largest: float = 1e-300) -> _Spectrum:
+    def of(cls, matrix: Float[np.ndarray, "... n n"], cut: float, largest: float = 1e-300) -> _Eigenspace:
         values, vectors = np.linalg.eigh(matrix)
         return cls(values=values, vectors=vectors, seen=values > cut * np.max(values, initial=largest))
 
@@ -160,24 +160,24 @@ class _Arrow:
     """The factors of an arrow: of each block, what takes the shaft's unknowns to the block's, and of the rest."""
 
     shape: ArrowShape
-    blocks: tuple[_Spectrum, ...]
+    blocks: tuple[_Eigenspace, ...]
     across: tuple[Float[np.ndarray, "..."], ...]
-    remainder: _Spectrum
+    remainder: _Eigenspace
 
     @classmethod
     def of(cls, matrix: Matrix, shape: ArrowShape, cut: float) -> _Arrow:
         shaft = matrix[shape.shaft][:, shape.shaft]
         reduced = shaft.copy()
-        blocks: list[_Spectrum] = []
+        blocks: list[_Eigenspace] = []
         across: Parts = []
         for rows in shape.blocks:
             beside = matrix[rows[:, :, None], shape.shaft]
-            blocks.append(_Spectrum.of(matrix[rows[:, :, None], rows[:, None, :]], cut))
+            blocks.append(_Eigenspace.of(matrix[rows[:, :, None], rows[:, None, :]], cut))
             across.append(blocks[-1].solve(beside))
             reduced -= np.einsum("bkp,bkq->pq", beside, across[-1])
         largest = float(np.max(np.linalg.eigvalsh(shaft), initial=1e-300))
         return cls(
-            shape=shape, blocks=tuple(blocks), across=tuple(across), remainder=_Spectrum.of(reduced, cut, largest)
+            shape=shape, blocks=tuple(blocks), across=tuple(across), remainder=_Eigenspace.of(reduced, cut, largest)
         )
 
     def solve(self, right: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:

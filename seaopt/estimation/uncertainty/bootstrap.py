@@ -171,13 +171,13 @@ def bootstrap(
     residuals = minimum.residuals()
     rng = np.random.default_rng(require_seed(seed, EstimationError))
     names = problem.shared_names
-    blocks: dict[str, _Blocks] = {}
+    blocks: dict[str, _ResidualBlocks] = {}
     for name, residual in residuals.items():
         used = _find_used_rows(residual)
         pool, count = _make_pool(residual, problem, refit), int(np.count_nonzero(used))
         length = min(block or estimate_block_length(residual.weighted[used]), max(count // 2, 1))
         starts = rng.integers(0, len(pool), size=(draws, -(-len(residual.raw) // length)))
-        blocks[name] = _Blocks(pool=pool, length=length, starts=starts)
+        blocks[name] = _ResidualBlocks(pool=pool, length=length, starts=starts)
     if refit:
         values = _draw_refits(minimum, residuals, blocks, draws, rng, executor)
     else:
@@ -242,7 +242,7 @@ def _make_pool(residuals: ExperimentResiduals, problem: FitProblem, raw: bool) -
 
 
 @record(eq=False)
-class _Blocks:
+class _ResidualBlocks:
     """The draws of an experiment: residuals to draw from, the length of blocks, and where they start."""
 
     pool: Float[np.ndarray, "m ny"]
@@ -255,7 +255,7 @@ class _Blocks:
 
 
 def _draw_steps(
-    minimum: Minimum, blocks: Mapping[str, _Blocks], draws: int, rng: np.random.Generator
+    minimum: Minimum, blocks: Mapping[str, _ResidualBlocks], draws: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "draws p"]:
     """Return one Gauss-Newton step per draw."""
     problem, z = minimum.problem, minimum.z
@@ -279,7 +279,7 @@ def _draw_steps(
 def _draw_refits(
     minimum: Minimum,
     residuals: ResidualsByExperiment,
-    blocks: Mapping[str, _Blocks],
+    blocks: Mapping[str, _ResidualBlocks],
     draws: int,
     rng: np.random.Generator,
     executor: Executor | None,
@@ -313,7 +313,9 @@ def _refit(trial: tuple[FitProblem, Vector]) -> tuple[float, Vector]:
     return float(solution.evaluation.cost), solution.z
 
 
-def _with_drawn(experiment: FitExperiment, residuals: ExperimentResiduals, blocks: _Blocks, d: int) -> FitExperiment:
+def _with_drawn(
+    experiment: FitExperiment, residuals: ExperimentResiduals, blocks: _ResidualBlocks, d: int
+) -> FitExperiment:
     """Return the experiment as if the model's outputs with the residuals of a draw had been measured."""
     first, segments = 0, list[FitSegment]()
     for segment, row in zip(experiment.segments, residuals.segments, strict=True):

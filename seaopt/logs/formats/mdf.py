@@ -129,7 +129,7 @@ def _load(path: Path, places: ChannelPlaces, names: Sequence[str], window: Windo
 
 
 @record
-class Block:
+class MdfBlock:
     """One block: its mark, its links, and where its data lie."""
 
     mark: bytes
@@ -145,7 +145,7 @@ def check_blocks(path: Path) -> None:
     with path.open("rb") as stream:
         if stream.read(8) != b"MDF     ":  # one that its recorder did not finish has no counts yet
             return
-        blocks = Blocks(path=path, stream=stream, size=path.stat().st_size)
+        blocks = MdfBlocks(path=path, stream=stream, size=path.stat().st_size)
         for group in blocks.walk(blocks.read(FIRST).links[0]):
             counted, present = blocks.count_bytes(group), sum(blocks.measure_data(group.links[2]))
             if counted is not None and counted != present:
@@ -153,7 +153,7 @@ def check_blocks(path: Path) -> None:
 
 
 @record(eq=False)
-class Blocks:
+class MdfBlocks:
     """The blocks of an open file, each of which is read once: links that lead back are damage."""
 
     path: Path
@@ -166,7 +166,7 @@ class Blocks:
         self.stream.seek(at)
         return struct.unpack(form, self.stream.read(struct.calcsize(form)))
 
-    def read(self, at: int) -> Block:
+    def read(self, at: int) -> MdfBlock:
         """Return the block that begins at a byte."""
         if at + struct.calcsize(HEADER) > self.size:
             raise LogError(f"{self.path}: a block is to begin at byte {at} of {self.size}, {WHOLE}")
@@ -177,16 +177,16 @@ class Blocks:
         if at in self.visited or len(self.visited) > MAX_BLOCKS:
             raise LogError(f"{self.path}: its blocks lead back to byte {at}, {WHOLE}")
         self.visited.add(at)
-        return Block(mark=mark[2:], links=self.take(start - 8 * count, f"<{count}Q"), start=start, end=at + length)
+        return MdfBlock(mark=mark[2:], links=self.take(start - 8 * count, f"<{count}Q"), start=start, end=at + length)
 
-    def walk(self, at: int) -> Iterator[Block]:
+    def walk(self, at: int) -> Iterator[MdfBlock]:
         """Walk blocks of which each one's first link is the next."""
         while at:
             block = self.read(at)
             yield block
             at = block.links[0]
 
-    def count_bytes(self, group: Block) -> int | None:
+    def count_bytes(self, group: MdfBlock) -> int | None:
         """Return the bytes that the channel groups' records take; None where some have no fixed length."""
         (numbered,) = self.take(group.start, "<B")  # bytes of the number of its group before each record
         total, fixed = 0, True
@@ -197,7 +197,7 @@ class Blocks:
             self.check_channels(channels, data + invalid)
         return total if fixed else None
 
-    def check_channels(self, group: Block, width: int) -> None:
+    def check_channels(self, group: MdfBlock, width: int) -> None:
         """Refuse channels that reach beyond their record, in which the reader would look elsewhere."""
         for channel in self.walk(group.links[1]):
             first_bit, first_byte, bits = self.take(channel.start, "<3xBII")
@@ -222,7 +222,7 @@ class Blocks:
         else:
             yield block.end - block.start
 
-    def unpack(self, block: Block) -> int:
+    def unpack(self, block: MdfBlock) -> int:
         """Return the length of a compressed block unpacked, where that and its checksum are right."""
         _, how, columns, length, packed = self.take(block.start, PACKED)
         begin = block.start + struct.calcsize(PACKED)

@@ -71,7 +71,7 @@ class Proposed:
         return tuple(name for name in self.plants if name in MOVING)
 
 
-class _Lines:
+class _ParameterLines:
     """Lines of [parameters], each with what it is and what of it is a guess."""
 
     def __init__(self, interview: Interview, facts: Facts, defaults: Mapping[str, Parameter], stiffness: str) -> None:
@@ -129,7 +129,7 @@ class _Lines:
 
 def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
     """Return a gear's actuator."""
-    lines = _Lines(interview, facts, rotary(link="pendulum").defaults, "N m/rad")
+    lines = _ParameterLines(interview, facts, rotary(link="pendulum").defaults, "N m/rad")
     effort, motor, link = (name in facts.outputs for name in ("tau_s", "theta_m", "theta_l"))
     moves = any(mounting != "held" for mounting in facts.places)
     why = "typical of a module; take it from the data sheet"
@@ -171,7 +171,7 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
     return Proposed(lines=tuple(lines.lines), plants=plants, measured=measured, ranges=ranges)
 
 
-def _add_drive(lines: _Lines, facts: Facts, *, effort: bool) -> None:
+def _add_drive(lines: _ParameterLines, facts: Facts, *, effort: bool) -> None:
     """Add K_tau and eta, of which a log tells the product at most, and what stands between command and current. A
     commanded torque makes K_tau and eta one.
     """
@@ -206,7 +206,7 @@ def _add_drive(lines: _Lines, facts: Facts, *, effort: bool) -> None:
         )
 
 
-def _add_payload(lines: _Lines, places: list[str]) -> dict[str, tuple[float, float]]:
+def _add_payload(lines: _ParameterLines, places: list[str]) -> dict[str, tuple[float, float]]:
     """Add the link that will hang from the joint, where no log had it, and return the range of its inertia. A link
     without gravity is no plant to certify on: under a torque controller its angle drifts.
     """
@@ -230,7 +230,7 @@ def _add_payload(lines: _Lines, places: list[str]) -> dict[str, tuple[float, flo
 
 def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     """Return a ball screw's actuator."""
-    lines = _Lines(interview, facts, thor(), "N/m")
+    lines = _ParameterLines(interview, facts, thor(), "N/m")
     forces, moves = facts.outputs & {"F1", "F2"}, "swing" in facts.places
     also = ", and correct the scale of q with it" if "screw" in facts.outputs else ""
     why = f"a typical value; take it from the data sheet{also}"
@@ -270,7 +270,7 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     return Proposed(lines=tuple(lines.lines), plants=plants, measured=measured, ranges=ranges)
 
 
-def _add_pendulum(lines: _Lines, noun: str) -> None:
+def _add_pendulum(lines: _ParameterLines, noun: str) -> None:
     lines.require("L_a", "Lever arm L_a of the force about the pivot", why="a typical value; measure it")
     lines.require("m", f"Mass of the {noun}", why="a typical value; weigh it")
     lines.require("L", "Distance L from its centre of mass to the pivot", why="a typical value; measure it")

@@ -163,7 +163,7 @@ class ConstrainedRuns(Result):
 
 
 @record(eq=False)
-class _Outcome:
+class _RunResult:
     """One run on one plant: its first fault, the signal furthest out of bounds, its ring, and what the law did."""
 
     fault: Fault | None = None
@@ -188,7 +188,7 @@ class _RunDraw:
 
 
 @record(eq=False)
-class _Case:
+class _PlantRun:
     """A run on one plant: the stage has the law in its linear region; `tolerance` is of bounds."""
 
     mpc: ForceMPC
@@ -198,7 +198,7 @@ class _Case:
     drawn: _RunDraw
 
     @property
-    def ideal(self) -> _Case:
+    def ideal(self) -> _PlantRun:
         """The same with an ideal sensor and amplifier."""
         return replace(self, stage=replace(self.stage, sensors=Sensors(), command_step=0.0))
 
@@ -207,7 +207,7 @@ class _Case:
         """Whether sensor and amplifier add nothing of their own."""
         return self.stage.sensors == Sensors() and not self.stage.command_step
 
-    def play(self) -> _Outcome:
+    def play(self) -> _RunResult:
         """Simulate the run, and judge it."""
         mpc, judge, steps, figures = self.mpc, Judge(), list[MPCStep](), dict[str, Any]()
         try:
@@ -219,7 +219,7 @@ class _Case:
         current = np.array([step.current_A for step in steps])  # before the amplifier rounds it
         slews = np.abs(np.diff(current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
         at_limit = int(np.count_nonzero(slews | (np.abs(current) > mpc.command_limit * (1.0 - 1e-6))))
-        return _Outcome(
+        return _RunResult(
             fault=judge.faults[0] if judge.faults else None,
             steps=len(steps),
             unsolved=sum(not step.solved for step in steps),
@@ -383,7 +383,7 @@ def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
     shared = Shared((mpc, stages, tolerance, unknown.nominal))
     played = map_ordered(partial(_play_run, shared), parts, survey.executor)
     kinds: list[str] = []
-    failed_run, outcomes = dict[str, Any](), list[_Outcome]()
+    failed_run, outcomes = dict[str, Any](), list[_RunResult]()
     for k in count_off(range(runs), "limits active, run", progress):
         of_plants = dict(zip(plants, next(played), strict=True))
         outcomes += of_plants.values()
@@ -446,19 +446,21 @@ def _count_samples(mpc: ForceMPC) -> tuple[int, int, int]:
 _Staged = tuple[ForceMPC, dict[str, Stage], float, ParameterSet]
 
 
-def _place_run(staged: _Staged, stage: Stage, run: _RunDraw) -> _Case:
+def _place_run(staged: _Staged, stage: Stage, run: _RunDraw) -> _PlantRun:
     """Return a run on one stage, at what was drawn."""
     mpc, _, tolerance, nominal = staged
     values = place_values(stage.plant, nominal, run.draw)
-    return _Case(mpc=mpc, stage=stage, tolerance=tolerance, values=values, drawn=run)
+    return _PlantRun(mpc=mpc, stage=stage, tolerance=tolerance, values=values, drawn=run)
 
 
-def _play_run(shared: Shared[_Staged], run: _RunDraw) -> list[_Outcome]:
+def _play_run(shared: Shared[_Staged], run: _RunDraw) -> list[_RunResult]:
     """Simulate one run on every plant, and judge it."""
     return [_place_run(shared.value, stage, run).play() for stage in shared.value[1].values()]
 
 
-def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[str, float], failed: _Outcome) -> str:
+def _find_remedy(
+    case: _PlantRun, name: str, nominal: ParameterSet, draw: Mapping[str, float], failed: _RunResult
+) -> str:
     """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
     mpc, plant = case.mpc, case.stage.plant
     over_bound = failed.fault is not None and failed.fault.kind == OVER_BOUND
@@ -491,7 +493,7 @@ def _find_remedy(case: _Case, name: str, nominal: ParameterSet, draw: Mapping[st
     return f"fit {wrong} or narrow their ranges in [robustness]: the model is too wrong in them{together}{room}"
 
 
-def _name_obstacle(mpc: ForceMPC, failed: _Outcome) -> str:
+def _name_obstacle(mpc: ForceMPC, failed: _RunResult) -> str:
     """Return what of the specification is in the way of a run on the plant that it was made for."""
     if failed.fault is None or failed.fault.kind != OVER_BOUND:
         return "a lower bandwidth_hz, or a longer horizon_s in [mpc]"

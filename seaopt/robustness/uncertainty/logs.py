@@ -213,7 +213,7 @@ def _find_base(controller: Controller, params: ParameterSet, part: _Record, f: L
 
 
 @record(eq=False)
-class _Lines:
+class _WindowLines:
     """The lines of windows of one length at which a log can tell of a loop."""
 
     f: Lines
@@ -238,7 +238,7 @@ class _Lines:
 
 def _tell(
     controller: Controller, params: ParameterSet, part: _Record, response: ResidualResponse, alpha: float
-) -> _Lines | None:
+) -> _WindowLines | None:
     """Return the lines at which a response can tell of the loop; None where they are too few."""
     from scipy.ndimage import median_filter  # deferred: 0.2 s
 
@@ -258,7 +258,7 @@ def _tell(
     first, last = np.flatnonzero(told)[[0, -1]]
     lines = (x[told] for x in (f, loop, error, std, unseen, radius))
     names = ("f", "loop", "error", "std", "unseen", "radius")
-    return _Lines(
+    return _WindowLines(
         **dict(zip(names, lines, strict=True)), freedom=response.freedom, gapless=bool(np.all(told[first:last]))
     )
 
@@ -297,7 +297,7 @@ def _judge(
     )
 
 
-def _bound_ms(lines: _Lines, limit: float) -> tuple[float, int]:
+def _bound_ms(lines: _WindowLines, limit: float) -> tuple[float, int]:
     """Return what Ms is at least by what the model does not predict, and at which line; infinite of a loop that turns
     about -1 otherwise than the model's.
     """
@@ -318,14 +318,14 @@ def _is_turned(model: Any, error: Any, radius: Any) -> bool:
     return bool(all(ends) and certain and abs(np.sum(steps)) > np.pi)
 
 
-def _ask_band(controller: Controller, lines: _Lines) -> tuple[float, float]:
+def _ask_band(controller: Controller, lines: _WindowLines) -> tuple[float, float]:
     """Return a band about the crossover and the largest sensitivity that is predicted."""
     middle = controller.achieved.crossover_hz or controller.spec.bandwidth_hz
     peaks = controller.achieved.ms_hz, float(lines.f[np.argmin(lines.predicted)])  # that of the design, and at the log
     return ABOUT[0] * middle, ABOUT[1] * float(np.nanmax([middle, *peaks]))
 
 
-def _confirm(controller: Controller, lines: _Lines, limit: float) -> tuple[float, float] | None:
+def _confirm(controller: Controller, lines: _WindowLines, limit: float) -> tuple[float, float] | None:
     """Return the band in which every line keeps the limit, the error of each along a radius; None where that lacks a
     part of the band that is asked.
     """

@@ -47,7 +47,7 @@ def predict_gain(
     c_y, c_r = loop.law.feedback_responses(f), loop.law.reference_response(f)
     limit = controller.command_limit
     most = np.inf if limit is None else limit / controller.command.per_effort
-    friction = _Friction.of(controller, plant, values, f)
+    friction = _FrictionPort.of(controller, plant, values, f)
     gains = SATURATION_GAINS if limit is not None else SATURATION_GAINS[:1]
     sigma = gains[:, None, None]
     closed = 1.0 / (1.0 + sigma * open_loop)  # (s, 1, f)
@@ -63,7 +63,7 @@ def predict_gain(
 
 
 @record(eq=False)
-class _Friction:
+class _FrictionPort:
     """The friction of a plant as a port of its loop, at frequencies; none where nothing changes with the velocity."""
 
     on_outputs: Complex[np.ndarray, "y f"]
@@ -72,7 +72,9 @@ class _Friction:
     gains: Float[np.ndarray, " v"]
 
     @classmethod
-    def of(cls, controller: Controller, plant: Plant, params: ParameterSet, f: Float[np.ndarray, " f"]) -> _Friction:
+    def of(
+        cls, controller: Controller, plant: Plant, params: ParameterSet, f: Float[np.ndarray, " f"]
+    ) -> _FrictionPort:
         (loop,) = take_friction_out(controller, plant, [params])
         nothing = np.zeros(f.size, dtype=complex)
         if loop is None or loop.only_port is None:

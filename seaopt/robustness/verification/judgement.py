@@ -192,7 +192,7 @@ def find_saturated(command: Float[np.ndarray, "..."], limit: float) -> float:
 
 
 @record(eq=False)
-class _Run:
+class _TraceRun:
     """One run of a trace."""
 
     stage: Stage
@@ -261,7 +261,7 @@ def judge_run(
     """
     judge, drawn, nominal = Judge(), sets[index], sets[0]
     view = linearise_last_phase(stage, scenario, drawn)
-    run = _Run(stage=stage, scenario=scenario, trace=trace, index=index)
+    run = _TraceRun(stage=stage, scenario=scenario, trace=trace, index=index)
     ideal = replace(run, trace=twin)
     finite = all(np.all(np.isfinite(signal)) for signal in (run.force, trace.current[index], ideal.force))
     judge.refuse("overflow", "" if finite else "its numbers overflow")
@@ -288,7 +288,7 @@ def judge_run(
     )
 
 
-def _judge_extremes(run: _Run, judge: Judge) -> None:
+def _judge_extremes(run: _TraceRun, judge: Judge) -> None:
     scenario, trace, index, command = run.scenario, run.trace, run.index, run.stage.controller.command
     force = float(trace.peaks[run.regulated][index])
     angles = [float(trace.peaks[name][index]) for name, unit in run.stage.plant.outputs.items() if unit == "rad"]
@@ -321,7 +321,7 @@ def _judge_extremes(run: _Run, judge: Judge) -> None:
         judge.require("no event", missed, 0.0, f"{name} never passes {value:g}, so that the scenario does not happen")
 
 
-def _judge_rest(run: _Run, drawn: ParameterSet, judge: Judge) -> None:
+def _judge_rest(run: _TraceRun, drawn: ParameterSet, judge: Judge) -> None:
     """Check that the motor can hold the plant where the draw puts it at rest."""
     start, limit, command = run.trace.equilibrium, run.stage.controller.command_limit, run.stage.controller.command
     if start is None or limit is None:
@@ -333,7 +333,7 @@ def _judge_rest(run: _Run, drawn: ParameterSet, judge: Judge) -> None:
     judge.require("rest", takes, limit * (1.0 + ABOVE_LIMIT), text, command.unit, remedy="narrow its range")
 
 
-def _judge_growth(run: _Run, judge: Judge) -> None:
+def _judge_growth(run: _TraceRun, judge: Judge) -> None:
     trace = run.trace
     if ENERGY in trace.outputs:
         base = (
@@ -355,7 +355,7 @@ def _judge_growth(run: _Run, judge: Judge) -> None:
     judge.require("growth", second, GROWTH * first + GROWTH_FLOOR * largest, text)
 
 
-def _judge_outbreak(run: _Run, ideal: _Run, view: LinearView, judge: Judge) -> None:
+def _judge_outbreak(run: _TraceRun, ideal: _TraceRun, view: LinearView, judge: Judge) -> None:
     """Check that noise does not set off a growing force error."""
     off, alone, last = np.abs(run.error), float(np.max(np.abs(ideal.error))), run.trace.last
     half = last.stop - (last.stop - last.start) // 2
@@ -365,7 +365,7 @@ def _judge_outbreak(run: _Run, ideal: _Run, view: LinearView, judge: Judge) -> N
     judge.require("outbreak", after, most, f"{run.regulated} is off by up to {end}", run.unit)
 
 
-def _judge_oscillation(run: _Run, drawn: ParameterSet, view: LinearView, judge: Judge) -> None:
+def _judge_oscillation(run: _TraceRun, drawn: ParameterSet, view: LinearView, judge: Judge) -> None:
     """Check that no oscillation lasts: a slow one in a long window, one whose phase noise moves in a short one."""
     stage, scenario = run.stage, run.scenario
     band, period = stage.controller.spec.bandwidth_hz, stage.controller.sample_time_s
@@ -390,7 +390,7 @@ def _judge_oscillation(run: _Run, drawn: ParameterSet, view: LinearView, judge: 
             return
 
 
-def _swings_alone(run: _Run, drawn: ParameterSet, frequency_hz: float) -> bool:
+def _swings_alone(run: _TraceRun, drawn: ParameterSet, frequency_hz: float) -> bool:
     """Tell whether a moving plant has a mode at a frequency while its joints stick, which no law can then damp."""
     if run.scenario.friction == "smooth" or not run.stage.plant.moves:
         return False
@@ -420,11 +420,11 @@ def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bo
     if limit is None or allowed is None:
         return False
     at_limit = (index for index, current in enumerate(trace.current) if find_saturated(current, limit))
-    runs = (_Run(stage=stage, scenario=scenario, trace=trace, index=index) for index in at_limit)
+    runs = (_TraceRun(stage=stage, scenario=scenario, trace=trace, index=index) for index in at_limit)
     return any(run.largest > allowed for run in runs)
 
 
-def _judge_step(run: _Run, most_s: float, judge: Judge, unlimited: Playback | None) -> None:
+def _judge_step(run: _TraceRun, most_s: float, judge: Judge, unlimited: Playback | None) -> None:
     """Judge a step from rest by its largest force, between samples too, and by when it has settled."""
     last, largest, allowed = run.trace.last, run.largest, run.scenario.max_overshoot
     outside = np.flatnonzero(np.abs(run.response[last] - 1.0) > SETTLED)
@@ -444,7 +444,7 @@ def _judge_step(run: _Run, most_s: float, judge: Judge, unlimited: Playback | No
     judge.require("settling", settling_s, most_s, f"{step} settles {when}, {most_s:.4g} s are allowed", "s")
 
 
-def _judge_final_error(run: _Run, ideal: _Run, judge: Judge) -> None:
+def _judge_final_error(run: _TraceRun, ideal: _TraceRun, judge: Judge) -> None:
     last, stage, most = run.trace.last, run.stage, run.scenario.final_error
     judged = max(1, (last.stop - last.start) // 5)
     error, alone = (float(np.mean(take_ends(each.error, [last.stop], judged))) for each in (run, ideal))

@@ -75,7 +75,7 @@ def lift(controller, differenced):
 def test_needed_inverse_is_that_of_a_lifted_loop(controller, loop, differenced):
     reading = SpeedReading(velocity=loop.velocity[0], differenced=differenced)
     theta = np.array([1e-3, 0.02, 0.1, 0.14, 0.4, 1.5, 3.0])
-    readings = stability._Readings.at(loop, reading, theta)
+    readings = stability._LoopAtAngles.at(loop, reading, theta)
     found = stability._MultiplierTest.of(readings, np.ones_like).find_least_inverse("1")
     phi, gamma, rows, through = lift(controller, differenced)
     inverse_slope = PARAMETERS["v_s"].value / 100.0

@@ -168,8 +168,8 @@ def integrate_by_hand(plant, spec, functions, x):
 
 @pytest.mark.parametrize("seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))])
 def test_the_bound_is_below_its_own_answer_and_close(monkeypatch, seed):
-    rng, solve, answers = np.random.default_rng(seed), free_law._Program.solve, []
-    monkeypatch.setattr(free_law._Program, "solve", lambda self: answers.append(solve(self)) or answers[-1])
+    rng, solve, answers = np.random.default_rng(seed), free_law._LinearProgram.solve, []
+    monkeypatch.setattr(free_law._LinearProgram, "solve", lambda self: answers.append(solve(self)) or answers[-1])
     rate, functions = float(rng.choice([400.0, 1000.0])), 8 if seed < 2 else int(rng.integers(10, 40))
     spec = so.ControllerSpec(
         structure=str(rng.choice(["pd", "pid"])), bandwidth_hz=float(rng.uniform(15.0, 40.0)), sample_rate_hz=rate,

@@ -138,8 +138,8 @@ def compensation_margin(
     """
     if obstacle := find_obstacle(loop):
         return CompensationMargin(slope=0.0, required=required, frequency_hz=0.0, multiplier=obstacle)
-    search = _Search(
-        loop=loop, reading=reading, required=required, base=_Readings.at(loop, reading, choose_angles(loop))
+    search = _MultiplierSearch(
+        loop=loop, reading=reading, required=required, base=_LoopAtAngles.at(loop, reading, choose_angles(loop))
     )
     best = CompensationMargin(
         slope=0.0, required=required, frequency_hz=0.0, multiplier="it is not without compensation either"
@@ -158,7 +158,7 @@ def compensation_margin(
 
 
 @record(eq=False)
-class _Readings:
+class _LoopAtAngles:
     """A loop at m angles, as the test takes it: friction's responses, R_s at every alias, P_s and S."""
 
     friction: LoopResponses
@@ -167,7 +167,7 @@ class _Readings:
     sensitivity: AtAngles
 
     @classmethod
-    def at(cls, loop: FrictionLoop, reading: SpeedReading, theta: Angles) -> _Readings:
+    def at(cls, loop: FrictionLoop, reading: SpeedReading, theta: Angles) -> _LoopAtAngles:
         """Return the responses of a loop at angles."""
         friction, period = find_responses(loop, theta), loop.plant.sample_time_s
         rows = loop.respond(theta, ORDERS, reading.velocity[None]).by_friction[..., 0, :] * np.sqrt(loop.slopes)
@@ -183,12 +183,12 @@ class _Readings:
 class _MultiplierTest:
     """The test for one multiplier of the friction: factors of Gamma, and of what it is tested with."""
 
-    at: _Readings
+    at: _LoopAtAngles
     left: Forms
     inner: Forms
 
     @classmethod
-    def of(cls, at: _Readings, multiplier: Multiplier) -> _MultiplierTest | None:
+    def of(cls, at: _LoopAtAngles, multiplier: Multiplier) -> _MultiplierTest | None:
         """Return the form at angles; None where the test fails without compensation."""
         gram = _gather(at, multiplier(at.friction.s))
         if gram is None:
@@ -226,13 +226,13 @@ class _MultiplierTest:
 
 
 @record(eq=False)
-class _Search:
+class _MultiplierSearch:
     """A loop, what the compensation reads, and the loop's responses at the first angles."""
 
     loop: FrictionLoop
     reading: SpeedReading
     required: float
-    base: _Readings
+    base: _LoopAtAngles
 
     def measure(
         self, form: _MultiplierTest, multiplier: Multiplier, shift: str, least: float
@@ -246,7 +246,7 @@ class _Search:
             if result.inverse > needed:
                 needed, worst = result.inverse, result.worst_angle
             theta = refine_angles(result.theta, -result.at_ratio(result.ratio))
-            finer = _MultiplierTest.of(_Readings.at(self.loop, self.reading, theta), multiplier)
+            finer = _MultiplierTest.of(_LoopAtAngles.at(self.loop, self.reading, theta), multiplier)
             if finer is None:
                 return None
             result, count = finer.find_least_inverse(shift), count + theta.size
@@ -285,7 +285,7 @@ def _shift(name: str, z: AtAngles) -> AtAngles:
     return 1.0 + sign * SHARE * (1.0 / z if "/" in name else z)
 
 
-def _gather(at: _Readings, weight: AtAliases) -> Forms | None:
+def _gather(at: _LoopAtAngles, weight: AtAliases) -> Forms | None:
     """Return a factor L of Gamma = L L*, what is beyond the aliases added; None where some D is not positive."""
     friction = at.friction
     possible, inverse = invert_mobility(weight, friction.mobility, 1.0)
