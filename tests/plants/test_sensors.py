@@ -11,7 +11,7 @@ from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import ParameterError, PlantError
 from seaopt.parameters import Parameter
 from seaopt.plants.sensors.deflection import evaluate_weights, find_scale
-from seaopt.robustness.verification.playback import Stage
+from seaopt.robustness.verification.playback import Rig
 
 KNEE = {"J_m": 1e-4, "b_r": 1e-3, "K_tau": 0.05, "N": 50.0, "k_s": 300.0, "c_s": 1.5, "J_l": 0.1, "d_l": 0.05}
 
@@ -171,6 +171,6 @@ def test_offset_and_range_of_an_encoder_reach_the_loop():
     assert rest() == pytest.approx(2.0, abs=1e-6)
     assert rest(offset={"theta_m": 0.2}) == pytest.approx(2.0 - 320.0 / 50.0 * 0.2, abs=1e-6)
     assert rest(saturation={"theta_m": 0.1}) > 10.0  # the reading ends at 0.64, and the law pushes on
-    stage = Stage(controller=controller, plant=plant, sensors=so.Sensors(offset={"theta_m": 0.2}))
+    stage = Rig(controller=controller, plant=plant, sensors=so.Sensors(offset={"theta_m": 0.2}))
     assert not stage.is_ideal  # a scenario is judged beside its ideal twin
     assert stage.ideal.is_ideal

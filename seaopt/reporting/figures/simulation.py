@@ -40,7 +40,7 @@ def simulation_panel(verification: Verification, row: Outcome) -> Panel:
     """Draw force (torque) and command of one run, simulated again. Of a run that passed the end of the last phase is
     left out; a run that failed is drawn whole, with the window that it is judged in.
     """
-    controller = verification.stages[row.plant].controller
+    controller = verification.rigs[row.plant].controller
     name, limit = controller.spec.regulated, controller.command_limit
     trace = verification.replay(row)
     visible = trace.time <= (_visible_until(trace) if row.passed else trace.time[-1])

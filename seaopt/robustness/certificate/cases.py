@@ -89,7 +89,7 @@ class Cases:
 
 
 @record(eq=False)
-class Survey:
+class CheckContext:
     """The cases of one law, how they are to be measured, and what earlier checks found."""
 
     subject: Subject
@@ -109,7 +109,7 @@ class Survey:
     sensors: Sensors | None = None
     measured: Mapping[str, MeasuredResponse] = field(default_factory=dict[str, MeasuredResponse])
     executor: Executor | None = None
-    places: Sequence[Survey] = ()  # of a schedule as a whole: those of its values
+    places: Sequence[CheckContext] = ()  # of a schedule as a whole: those of its values
     found: Mapping[str, Any] = field(default_factory=dict[str, Any])  # fields of the certificate, of earlier checks
 
     @property
@@ -161,34 +161,36 @@ class Evidence:
 class Check:
     """One thing to look at; `seconds` that it takes as a rule."""
 
-    measure: Callable[[Survey, Progress], Evidence]
-    seconds: Callable[[Survey], float] = lambda _: 0.0
-    applies: Callable[[Survey], bool] = lambda survey: bool(survey.cases.models)
+    measure: Callable[[CheckContext, Progress], Evidence]
+    seconds: Callable[[CheckContext], float] = lambda _: 0.0
+    applies: Callable[[CheckContext], bool] = lambda context: bool(context.cases.models)
     # Whether it is asked where a requirement is broken already, and what takes long is then left out.
-    brief: Callable[[Survey], bool] = lambda _: False
+    brief: Callable[[CheckContext], bool] = lambda _: False
 
 
-def ask(checks: Sequence[Check], survey: Survey, progress: Progress) -> Evidence:
+def ask(checks: Sequence[Check], context: CheckContext, progress: Progress) -> Evidence:
     """Return what each of some checks that applies finds, with the fields that were found before."""
-    applicable = [check for check in checks if check.applies(survey)]
+    applicable = [check for check in checks if check.applies(context)]
     rows, remarks = list[Requirement](), list[str]()
-    for check, part in zip(applicable, divide(progress, *(check.seconds(survey) for check in applicable)), strict=True):
-        if survey.ends_early and not check.brief(survey):
+    for check, part in zip(
+        applicable, divide(progress, *(check.seconds(context) for check in applicable)), strict=True
+    ):
+        if context.ends_early and not check.brief(context):
             remarks += [] if ENDED in remarks else [ENDED]
             continue
-        evidence = check.measure(survey, part)
+        evidence = check.measure(context, part)
         for row in evidence.requirements:
             risk = evidence.risk if row.risk is None else row.risk
-            rows.append(replace(row, place=row.place or survey.place, scope=evidence.scope, risk=risk))
+            rows.append(replace(row, place=row.place or context.place, scope=evidence.scope, risk=risk))
         remarks += evidence.remarks
-        broken = survey.broken or not all(row.met for row in evidence.requirements)
-        survey = replace(survey, found={**survey.found, **evidence.fields}, broken=broken)
-    return Evidence(requirements=rows, fields=survey.found, remarks=tuple(remarks))
+        broken = context.broken or not all(row.met for row in evidence.requirements)
+        context = replace(context, found={**context.found, **evidence.fields}, broken=broken)
+    return Evidence(requirements=rows, fields=context.found, remarks=tuple(remarks))
 
 
-def count_seconds(checks: Sequence[Check], survey: Survey) -> float:
+def count_seconds(checks: Sequence[Check], context: CheckContext) -> float:
     """Return how long the checks that apply take as a rule."""
-    return sum(check.seconds(survey) for check in checks if check.applies(survey))
+    return sum(check.seconds(context) for check in checks if check.applies(context))
 
 
 def pose(

@@ -434,7 +434,7 @@ class Certificate(Result, Worded):
     def _sticks_without_noise(self) -> bool:
         """Whether friction that sticks was simulated with a sensor without noise."""
         runs = self.runs
-        if runs is None or any(any(stage.sensors.noise_std.values()) for stage in runs.stages.values()):
+        if runs is None or any(any(rig.sensors.noise_std.values()) for rig in runs.rigs.values()):
             return False
         return any(each.friction == "sticking" for chosen in runs.scenarios.values() for each in chosen)
 

@@ -34,8 +34,8 @@ from seaopt.robustness.certificate.cases import (
     Cases,
     CertifyOptions,
     Check,
+    CheckContext,
     Subject,
-    Survey,
     ask,
     count_seconds,
     digest_laws,
@@ -216,7 +216,7 @@ def certify(
     others, certified = others or ParameterSet(), subject if isinstance(subject, ScheduledController) else law
     posed = pose(certified, plants, parameters, ranges or {}, others, bounds)
     make = partial(
-        Survey,
+        CheckContext,
         subject=subject,
         source=parameters,
         supplement=others,
@@ -227,10 +227,10 @@ def certify(
         sensors=sensors,
         executor=executor,
     )
-    surveys = _list_surveys(subject, posed, make, options)
+    contexts = _list_contexts(subject, posed, make, options)
     if isinstance(subject, ScheduledController):
-        return _certify_schedule(replace(surveys[-1], place=None, measured=measured or {}, places=surveys), progress)
-    certificate = _certify_cases(replace(surveys[0], measured=measured or {}), CHECKS, progress)
+        return _certify_schedule(replace(contexts[-1], place=None, measured=measured or {}, places=contexts), progress)
+    certificate = _certify_cases(replace(contexts[0], measured=measured or {}), CHECKS, progress)
     draws = certificate.monte_carlo
     progress(f"{draws.samples} draws, {format_count(draws.failures, 'failure')}", 1.0)
     return certificate
@@ -270,9 +270,9 @@ def _check_responses(law: Controller, plants: Plants, measured: Mapping[str, Mea
         )
 
 
-def _list_surveys(
-    subject: Subject, posed: Mapping[float | None, Cases], make: Callable[..., Survey], options: CertifyOptions
-) -> list[Survey]:
+def _list_contexts(
+    subject: Subject, posed: Mapping[float | None, Cases], make: Callable[..., CheckContext], options: CertifyOptions
+) -> list[CheckContext]:
     """Return what is to be measured of a law, or at each place of a schedule. Points are simulated where the design
     plant holds the variable: a law that is frozen is not what runs on one that moves it.
     """
@@ -297,16 +297,16 @@ def _list_surveys(
     ]
 
 
-def _certify_schedule(whole: Survey, progress: Progress) -> Certificate:
+def _certify_schedule(whole: CheckContext, progress: Progress) -> Certificate:
     """Certify a schedule at each of its places, between them, and where responses were measured."""
-    surveys, schedule, of_responses = whole.places, whole.schedule, ask((MEASURED,), whole, ignore)
-    seconds = [count_seconds(CHECKS, survey) for survey in surveys]
+    contexts, schedule, of_responses = whole.places, whole.schedule, ask((MEASURED,), whole, ignore)
+    seconds = [count_seconds(CHECKS, context) for context in contexts]
     *parts, joining = divide(progress, *seconds, count_seconds(SCHEDULE_CHECKS, whole))
     places, broken = list[Certificate](), False
-    for survey, part in zip(surveys, parts, strict=True):
-        assert survey.place is not None
-        hook = prefix(part, f"{schedule.over} = {survey.place[1]:.4g}")
-        places.append(_certify_cases(replace(survey, broken=broken), CHECKS, hook))
+    for context, part in zip(contexts, parts, strict=True):
+        assert context.place is not None
+        hook = prefix(part, f"{schedule.over} = {context.place[1]:.4g}")
+        places.append(_certify_cases(replace(context, broken=broken), CHECKS, hook))
         broken = broken or not places[-1].met or places[-1].monte_carlo.failures > 0
     found = {"places": (*places,)}
     joint = _certify_cases(replace(whole, found=found, broken=broken), SCHEDULE_CHECKS, joining)
@@ -321,10 +321,10 @@ def _certify_schedule(whole: Survey, progress: Progress) -> Certificate:
     )
 
 
-def _certify_cases(survey: Survey, checks: Sequence[Check], progress: Progress) -> Certificate:
+def _certify_cases(context: CheckContext, checks: Sequence[Check], progress: Progress) -> Certificate:
     """Ask each check that applies to the cases of one law, or of a schedule as a whole."""
-    cases, evidence = survey.cases, ask(checks, survey, progress)
-    steps = NO_MODEL if not cases.models else ENDED if survey.steps and ENDED in evidence.remarks else None
+    cases, evidence = context.cases, ask(checks, context, progress)
+    steps = NO_MODEL if not cases.models else ENDED if context.steps and ENDED in evidence.remarks else None
     none: dict[str, Any] = {"plants": {}, "margins": {}, "steps": steps}
     return Certificate(
         requirements=tuple(evidence.requirements),
@@ -332,7 +332,7 @@ def _certify_cases(survey: Survey, checks: Sequence[Check], progress: Progress) 
         models=cases.models,
         parameters=cases.unknown.nominal,
         varied=cases.unknown.varied(),
-        place=survey.place,
+        place=context.place,
         remarks=evidence.remarks,
         **none | dict(evidence.fields),
     )

@@ -39,7 +39,7 @@ from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import output_function
 from seaopt.progress import Progress
 from seaopt.records import record
-from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
+from seaopt.robustness.certificate.cases import Cases, Check, CheckContext, Draw, Evidence
 from seaopt.robustness.certificate.friction import MarginDraws, draw_margins
 from seaopt.robustness.certificate.measured_draws import judge_draws
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_least, require_at_most
@@ -59,15 +59,15 @@ WITHOUT_RIPPLE = (
 FROM_REFERENCE = "friction is compensated from the reference, outside the loop: its stability is the law's without it"
 
 
-def measure_compensation(survey: Survey, _: Progress) -> Evidence:
+def measure_compensation(context: CheckContext, _: Progress) -> Evidence:
     """Return whether the loop stays stable with what is compensated, on every plant and over draws."""
-    cases, controller = survey.cases, survey.cases.controller
+    cases, controller = context.cases, context.cases.controller
     ripple = None if controller.compensation is None else controller.compensation.ripple
     opened = ripple is not None and any(ripple.reads in plant.outputs for plant in cases.models.values())
     margins = find_nominal_compensation(controller, cases.models, cases.unknown.nominal)
     shown = {name: partial(_find_margins, each.multiplier) for name, each in margins.items() if each.shown}
-    draws = draw_margins(survey, shown)
-    gravity, ripple = find_gravity_cases(survey), find_ripple_cases(survey)
+    draws = draw_margins(context, shown)
+    gravity, ripple = find_gravity_cases(context), find_ripple_cases(context)
     return Evidence(
         requirements=(
             *compensation_requirements(controller, margins, draws),
@@ -80,7 +80,7 @@ def measure_compensation(survey: Survey, _: Progress) -> Evidence:
 
 
 COMPENSATION = Check(
-    measure=measure_compensation, applies=lambda survey: survey.cases.controller.compensation is not None
+    measure=measure_compensation, applies=lambda context: context.cases.controller.compensation is not None
 )
 
 
@@ -146,25 +146,25 @@ class EigenvalueCase:
 Measure = Callable[[Controller, Plant, ParameterSet, Draw], EigenvalueCase]
 
 
-def find_gravity_cases(survey: Survey) -> dict[str, EigenvalueCase]:
+def find_gravity_cases(context: CheckContext) -> dict[str, EigenvalueCase]:
     """Return how fast each plant's link runs away at most with its weight compensated; none of held links."""
-    compensation, models = survey.cases.controller.compensation, survey.cases.models
+    compensation, models = context.cases.controller.compensation, context.cases.models
     term = None if compensation is None else compensation.gravity
     moving = [name for name, model in models.items() if model.port is not None and term and term.reads in model.outputs]
-    return _find_worst(measure_gravity, survey, moving)
+    return _find_worst(measure_gravity, context, moving)
 
 
-def find_ripple_cases(survey: Survey) -> dict[str, EigenvalueCase]:
+def find_ripple_cases(context: CheckContext) -> dict[str, EigenvalueCase]:
     """Return the largest eigenvalue of every plant's loop over the slopes of a ripple's compensation; empty without."""
-    compensation = survey.cases.controller.compensation
+    compensation = context.cases.controller.compensation
     ripples = compensation is not None and compensation.ripple is not None
-    return _find_worst(measure_ripple, survey, list(survey.cases.models) if ripples else ())
+    return _find_worst(measure_ripple, context, list(context.cases.models) if ripples else ())
 
 
-def _find_worst(measure: Measure, survey: Survey, names: Collection[str]) -> dict[str, EigenvalueCase]:
+def _find_worst(measure: Measure, context: CheckContext, names: Collection[str]) -> dict[str, EigenvalueCase]:
     """Return the worst case of some plants, among the nominal parameters and draws."""
     judges = dict.fromkeys(names, partial(_measure_draws, measure))
-    made = judge_draws(survey, EIGENVALUE_DRAWS, judges, nominal=[{}])
+    made = judge_draws(context, EIGENVALUE_DRAWS, judges, nominal=[{}])
     return {name: choose_worst(case for _, case in pairs) for name, pairs in made.items()}
 
 

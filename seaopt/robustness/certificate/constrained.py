@@ -42,16 +42,16 @@ from seaopt.plants import Plant
 from seaopt.plants.plant import deflection_row
 from seaopt.progress import Progress, count_off
 from seaopt.records import Result, record
-from seaopt.robustness.certificate.cases import Check, Evidence, Survey
+from seaopt.robustness.certificate.cases import Check, CheckContext, Evidence
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.uncertainty.failure_probability import failure_bound
 from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.robustness.verification.judgement import Fault, Judge, find_noise_floor, take_ends
 from seaopt.robustness.verification.linear import LinearView, view_loop
 from seaopt.robustness.verification.oscillation import Oscillation, Signal, measure_swing
-from seaopt.robustness.verification.playback import Stage
+from seaopt.robustness.verification.playback import Rig
 from seaopt.robustness.verification.scenarios import SETTLED
-from seaopt.robustness.verification.verification import make_stages
+from seaopt.robustness.verification.verification import make_rigs
 from seaopt.units import LINEAR
 
 CONSTRAINED_STREAM = 0x3C  # the runs' own stream of random numbers, whatever the seed
@@ -189,10 +189,10 @@ class _RunDraw:
 
 @record(eq=False)
 class _PlantRun:
-    """A run on one plant: the stage has the law in its linear region; `tolerance` is of bounds."""
+    """A run on one plant: the rig has the law in its linear region; `tolerance` is of bounds."""
 
     mpc: ForceMPC
-    stage: Stage
+    rig: Rig
     tolerance: float
     values: ParameterSet
     drawn: _RunDraw
@@ -200,12 +200,12 @@ class _PlantRun:
     @property
     def ideal(self) -> _PlantRun:
         """The same with an ideal sensor and amplifier."""
-        return replace(self, stage=replace(self.stage, sensors=Sensors(), command_step=0.0))
+        return replace(self, rig=replace(self.rig, sensors=Sensors(), command_step=0.0))
 
     @property
     def is_ideal(self) -> bool:
         """Whether sensor and amplifier add nothing of their own."""
-        return self.stage.sensors == Sensors() and not self.stage.command_step
+        return self.rig.sensors == Sensors() and not self.rig.command_step
 
     def play(self) -> _RunResult:
         """Simulate the run, and judge it."""
@@ -241,9 +241,9 @@ class _PlantRun:
         """Return the samples of the run, and add each step of the law to `steps`. An outer loop is given what it makes
         the reference of, an x_0 or a force, and asks for the force of one sample: with it there is no preview.
         """
-        mpc, stage = self.mpc, self.stage
+        mpc, rig = self.mpc, self.rig
         outer = mpc.outer
-        moved = outer is not None and outer.position in stage.plant.outputs
+        moved = outer is not None and outer.position in rig.plant.outputs
 
         def law(state: Any, r: Any, y: Any) -> tuple[float, Any]:
             plan, kept = state
@@ -258,15 +258,15 @@ class _PlantRun:
         return close_loop(
             law,
             (mpc.start, FIRST),
-            stage.plant,
+            rig.plant,
             self.values,
             self.drawn.reference,
             measured=(mpc.measured, outer.position) if outer is not None and moved else mpc.measured,
             sample_time_s=mpc.sample_time_s,
             delay_samples=mpc.compute_delay_samples,
             preview_samples=mpc.spec.preview_samples if outer is None else 0,
-            sensors=stage.sensors,
-            command_step=stage.command_step,
+            sensors=rig.sensors,
+            command_step=rig.command_step,
             command_limit=mpc.command_limit,
             disturbance_A=self.drawn.disturbance,
             seed=self.drawn.seed,
@@ -283,7 +283,7 @@ class _PlantRun:
         first, second = np.max(off[-lasting : -lasting // 2]), float(np.max(off[-lasting // 2 :]))
         grows = f"the error grows to {second:.4g} {run.unit} over the last phase"
         judge.require(DIVERGED, second, GROWTH * first + SETTLED * limit, grows, run.unit)
-        if self.stage.plant.moves:
+        if self.rig.plant.moves:
             return
         end_of_step = run.time.size - lasting - mpc.spec.preview_samples  # before its end the next phase is known
         ends = (run.time.size, end_of_step, end_of_step - phase)
@@ -297,13 +297,13 @@ class _PlantRun:
         that half of the runs that ring look as if they died out. What dies out is therefore no fault only where the
         same run on ideal devices has as much of it.
         """
-        view = view_loop(self.stage, self.stage.plant, self.values)
+        view = view_loop(self.rig, self.rig.plant, self.values)
         swing = self._measure_ring(run, view)
         fading = not (swing.sustained or swing.growing)
         if fading and self.is_ideal:
             return 0.0
         peak, lowest_hz = float(np.max(np.abs(run.force))), SLOWEST * self.mpc.spec.bandwidth_hz
-        floor = find_noise_floor(self.stage, peak, view, lowest_hz)
+        floor = find_noise_floor(self.rig, peak, view, lowest_hz)
         if fading and swing.amplitude > floor and not self._rings_by_devices(swing.amplitude, view):
             return 0.0
         what = f"an oscillation of {swing.amplitude:.3g} {run.unit}, at {swing.frequency_hz:.3g} Hz most, "
@@ -337,7 +337,7 @@ class _PlantRun:
 
     def _find_violation(self, run: ForceRun) -> tuple[float, str]:
         """Return by how much a bounded signal leaves its bounds at most, over half their width, and which it is."""
-        plant, traces = self.stage.plant, dict[str, Signal]()
+        plant, traces = self.rig.plant, dict[str, Signal]()
         if plant.spring is not None:
             stretch = run.state @ deflection_row(plant, plant.complete(self.values))
             traces = {"spring_deflection": stretch, "spring_rate": np.gradient(stretch, self.mpc.sample_time_s)}
@@ -350,27 +350,27 @@ class _PlantRun:
         return max((case for case in beyond if case[0] > 0.0), default=(0.0, ""), key=lambda case: case[0])
 
 
-def measure_constrained(survey: Survey, progress: Progress) -> Evidence:
+def measure_constrained(context: CheckContext, progress: Progress) -> Evidence:
     """Draw and simulate runs of predictive control with limits active, each on every plant."""
-    runs = run_constrained(survey, progress)
-    rows = require_constrained(runs, survey.options.max_failure_probability)
+    runs = run_constrained(context, progress)
+    rows = require_constrained(runs, context.options.max_failure_probability)
     return Evidence(requirements=rows, fields={"constrained": runs}, scope="simulated")
 
 
 CONSTRAINED = Check(
     measure=measure_constrained,
-    seconds=lambda survey: RUN_SECONDS * survey.options.runs * len(survey.cases.models),
-    applies=lambda survey: isinstance(survey.subject, ForceMPC),
+    seconds=lambda context: RUN_SECONDS * context.options.runs * len(context.cases.models),
+    applies=lambda context: isinstance(context.subject, ForceMPC),
 )
 
 
-def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
-    """Return what runs with limits active come to; the survey's law is the linear region of its subject."""
-    mpc = survey.subject
+def run_constrained(context: CheckContext, progress: Progress) -> ConstrainedRuns:
+    """Return what runs with limits active come to; the context's law is the linear region of its subject."""
+    mpc = context.subject
     assert isinstance(mpc, ForceMPC)
-    law, plants, unknown = survey.cases.controller, survey.cases.models, survey.cases.unknown
-    runs, seed, sensors = survey.options.runs, survey.options.seed, survey.sensors or Sensors()
-    tolerance, command_step = survey.options.bound_tolerance, survey.options.command_step
+    law, plants, unknown = context.cases.controller, context.cases.models, context.cases.unknown
+    runs, seed, sensors = context.options.runs, context.options.seed, context.sensors or Sensors()
+    tolerance, command_step = context.options.bound_tolerance, context.options.command_step
     rng = np.random.default_rng([seed, CONSTRAINED_STREAM])
     drawn = unknown.values(unknown.draw(runs, rng))
     placed = {name for plant in plants.values() for name in conditions((plant,)) if name not in DELAYS}
@@ -379,9 +379,9 @@ def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
         draw = {name: float(column[k]) for name, column in drawn.items() if name not in placed}
         reference, disturbance = _draw_references(mpc, rng)
         parts.append(_RunDraw(draw=draw, seed=seed + k, reference=reference, disturbance=disturbance))
-    stages = make_stages(law, plants, sensors, command_step)
-    shared = Shared((mpc, stages, tolerance, unknown.nominal))
-    played = map_ordered(partial(_play_run, shared), parts, survey.executor)
+    rigs = make_rigs(law, plants, sensors, command_step)
+    shared = Shared((mpc, rigs, tolerance, unknown.nominal))
+    played = map_ordered(partial(_play_run, shared), parts, context.executor)
     kinds: list[str] = []
     failed_run, outcomes = dict[str, Any](), list[_RunResult]()
     for k in count_off(range(runs), "limits active, run", progress):
@@ -390,9 +390,9 @@ def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
         failed, fault = next(((name, each.fault) for name, each in of_plants.items() if each.fault), ("", None))
         kinds.append("" if fault is None else fault.kind)
         if fault is not None and not failed_run:
-            stage, draw, outcome = stages[failed], parts[k].draw, of_plants[failed]
-            has = place_values(stage.plant, unknown.nominal, draw)
-            used, case = {key: draw[key] for key in draw if key in has}, _place_run(shared.value, stage, parts[k])
+            rig, draw, outcome = rigs[failed], parts[k].draw, of_plants[failed]
+            has = place_values(rig.plant, unknown.nominal, draw)
+            used, case = {key: draw[key] for key in draw if key in has}, _place_run(shared.value, rig, parts[k])
             remedy = _find_remedy(case, failed, unknown.nominal, used, outcome)
             failed_run.update(plant=failed, run=str(k + 1), text=fault.text, parameters=used, remedy=remedy)
     failures, steps = sum(map(bool, kinds)), max(sum(outcome.steps for outcome in outcomes), 1)
@@ -411,8 +411,8 @@ def run_constrained(survey: Survey, progress: Progress) -> ConstrainedRuns:
         over_bound=kinds.count(OVER_BOUND),
         not_settled=kinds.count(UNSETTLED),
         ringing=kinds.count(RINGS),
-        confidence=survey.options.confidence,
-        failure_probability_bound=failure_bound(runs, failures, survey.options.confidence),
+        confidence=context.options.confidence,
+        failure_probability_bound=failure_bound(runs, failures, context.options.confidence),
         bound_tolerance=tolerance,
         largest_violation=max(outcome.violation for outcome in outcomes),
         largest_ring=max(outcome.ring for outcome in outcomes),
@@ -443,26 +443,26 @@ def _count_samples(mpc: ForceMPC) -> tuple[int, int, int]:
     return round(REST_S * rate), round(phase_s * rate), round((phase_s + JUDGED_PERIODS / band) * rate)
 
 
-_Staged = tuple[ForceMPC, dict[str, Stage], float, ParameterSet]
+_Staged = tuple[ForceMPC, dict[str, Rig], float, ParameterSet]
 
 
-def _place_run(staged: _Staged, stage: Stage, run: _RunDraw) -> _PlantRun:
-    """Return a run on one stage, at what was drawn."""
+def _place_run(staged: _Staged, rig: Rig, run: _RunDraw) -> _PlantRun:
+    """Return a run on one rig, at what was drawn."""
     mpc, _, tolerance, nominal = staged
-    values = place_values(stage.plant, nominal, run.draw)
-    return _PlantRun(mpc=mpc, stage=stage, tolerance=tolerance, values=values, drawn=run)
+    values = place_values(rig.plant, nominal, run.draw)
+    return _PlantRun(mpc=mpc, rig=rig, tolerance=tolerance, values=values, drawn=run)
 
 
 def _play_run(shared: Shared[_Staged], run: _RunDraw) -> list[_RunResult]:
     """Simulate one run on every plant, and judge it."""
-    return [_place_run(shared.value, stage, run).play() for stage in shared.value[1].values()]
+    return [_place_run(shared.value, rig, run).play() for rig in shared.value[1].values()]
 
 
 def _find_remedy(
     case: _PlantRun, name: str, nominal: ParameterSet, draw: Mapping[str, float], failed: _RunResult
 ) -> str:
     """Return what to change for a run that failed: iterations, specification, plant, or what was drawn of it."""
-    mpc, plant = case.mpc, case.stage.plant
+    mpc, plant = case.mpc, case.rig.plant
     over_bound = failed.fault is not None and failed.fault.kind == OVER_BOUND
 
     def fails(values: ParameterSet) -> bool:
@@ -477,7 +477,7 @@ def _find_remedy(
             "ones that run passes"
         )
     design, values = mpc.design
-    if (of_design := replace(case, stage=replace(case.stage, plant=design), values=values).play()).fault:
+    if (of_design := replace(case, rig=replace(case.rig, plant=design), values=values).play()).fault:
         return f"{_name_obstacle(mpc, of_design)}: the run fails on the design plant with its own parameters too"
     room = f", or leave {failed.signal} more room by bound_tolerance" if over_bound else ""
     at_nominal = place_values(plant, nominal, {})

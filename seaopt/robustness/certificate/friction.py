@@ -24,7 +24,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction
 from seaopt.progress import Progress
 from seaopt.records import record
-from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
+from seaopt.robustness.certificate.cases import Cases, Check, CheckContext, Draw, Evidence
 from seaopt.robustness.certificate.measured_draws import judge_draws
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN, DrawnAt, Requirement, require_at_least
 
@@ -54,21 +54,21 @@ class MarginDraws:
         return f"{head}, the least up to {self.factor:.3g} times its own{where}"
 
 
-def measure_friction(survey: Survey, progress: Progress) -> Evidence:
+def measure_friction(context: CheckContext, progress: Progress) -> Evidence:
     """Return for how steep a friction stability is shown on every plant, and what is required of that."""
     progress("friction at the draws", 0.0)
-    controller = survey.cases.controller
-    margins = find_nominal_margins(controller, survey.cases.models, survey.cases.unknown.nominal)
-    draws = find_margins_at_draws(survey, margins)
-    rows = friction_requirements(margins, draws, survey.min_friction_margin, controller.command.mechanics.damping)
+    controller = context.cases.controller
+    margins = find_nominal_margins(controller, context.cases.models, context.cases.unknown.nominal)
+    draws = find_margins_at_draws(context, margins)
+    rows = friction_requirements(margins, draws, context.min_friction_margin, controller.command.mechanics.damping)
     fields = {"friction": margins, "friction_draws": draws}
     return Evidence(requirements=rows, fields=fields, scope="drawn" if draws else "nominal")
 
 
 FRICTION = Check(
     measure=measure_friction,
-    seconds=lambda survey: SECONDS * len(survey.cases.plants),
-    brief=lambda survey: survey.min_friction_margin is not None,
+    seconds=lambda context: SECONDS * len(context.cases.plants),
+    brief=lambda context: context.min_friction_margin is not None,
 )
 
 
@@ -80,24 +80,24 @@ def find_nominal_margins(
     return {name: margin for name, margin in margins.items() if margin is not None}
 
 
-def find_margins_at_draws(survey: Survey, nominal: Mapping[str, FrictionMargin]) -> dict[str, MarginDraws]:
+def find_margins_at_draws(context: CheckContext, nominal: Mapping[str, FrictionMargin]) -> dict[str, MarginDraws]:
     """Return margins at draws, of plants whose nominal margin is shown or enough, or that rub at draws alone."""
-    unknown, required = survey.cases.unknown, survey.min_friction_margin
+    unknown, required = context.cases.unknown, context.min_friction_margin
     varied = [row.name for row in unknown.varied()]
     enough = {
         name: nominal.get(name)
-        for name, model in survey.cases.models.items()
+        for name, model in context.cases.models.items()
         if has_friction(model, unknown.nominal, varied) and _shows_enough(nominal.get(name), required)
     }
-    return draw_margins(survey, {name: partial(_find_margins, margin) for name, margin in enough.items()})
+    return draw_margins(context, {name: partial(_find_margins, margin) for name, margin in enough.items()})
 
 
 def draw_margins(
-    survey: Survey, judges: Mapping[str, Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Margin]]]
+    context: CheckContext, judges: Mapping[str, Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Margin]]]
 ) -> dict[str, MarginDraws]:
     """Return what plants' judgements make of draws."""
     made: dict[str, MarginDraws] = {}
-    for name, pairs in judge_draws(survey, MARGIN_DRAWS, judges).items():
+    for name, pairs in judge_draws(context, MARGIN_DRAWS, judges).items():
         draw, margin = min(pairs, key=lambda pair: _take_slope(pair[1]))
         made[name] = MarginDraws(
             samples=len(pairs),

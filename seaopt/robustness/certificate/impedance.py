@@ -22,7 +22,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import split_friction
 from seaopt.progress import Progress
 from seaopt.records import record
-from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
+from seaopt.robustness.certificate.cases import Cases, Check, CheckContext, Draw, Evidence
 from seaopt.robustness.certificate.measured_draws import judge_draws
 from seaopt.robustness.certificate.requirement import DrawnAt, Requirement, require_at_most
 from seaopt.robustness.uncertainty.worst import place_values
@@ -91,20 +91,20 @@ class CertifiedImpedance:
         ]
 
 
-def measure_impedance(survey: Survey, progress: Progress) -> Evidence:
+def measure_impedance(context: CheckContext, progress: Progress) -> Evidence:
     """Return what the outer loop renders, over draws too where it is safe at the nominal parameters."""
-    cases = survey.cases
+    cases = context.cases
     impedance = certify_impedance(cases.controller, cases.models, cases.unknown.nominal)
     if impedance is not None and impedance.safe:
-        impedance = replace(impedance, draws=draw_impedance(survey, progress))
+        impedance = replace(impedance, draws=draw_impedance(context, progress))
     scope = "drawn" if impedance is not None and impedance.draws is not None else "nominal"
     return Evidence(requirements=impedance_requirements(impedance), fields={"impedance": impedance}, scope=scope)
 
 
 IMPEDANCE = Check(
     measure=measure_impedance,
-    seconds=lambda survey: SECONDS * min(survey.samples, IMPEDANCE_DRAWS),
-    applies=lambda survey: survey.cases.controller.outer is not None,
+    seconds=lambda context: SECONDS * min(context.samples, IMPEDANCE_DRAWS),
+    applies=lambda context: context.cases.controller.outer is not None,
 )
 
 
@@ -149,15 +149,15 @@ def _find_plant(controller: Controller, models: Mapping[str, Plant]) -> str:
     return name
 
 
-def draw_impedance(survey: Survey, progress: Progress) -> ImpedanceDraws | None:
+def draw_impedance(context: CheckContext, progress: Progress) -> ImpedanceDraws | None:
     """Judge the impedance of a controller's outer loop at draws; None where nothing is drawn."""
-    name = _find_plant(survey.cases.controller, survey.cases.models)
+    name = _find_plant(context.cases.controller, context.cases.models)
     progress("impedance, draws", 0.0)
-    pairs = judge_draws(survey, IMPEDANCE_DRAWS, {name: _judge_states}).get(name)
+    pairs = judge_draws(context, IMPEDANCE_DRAWS, {name: _judge_states}).get(name)
     if pairs is None:
         return None
     draw, (_, margin) = min(pairs, key=lambda pair: pair[1][1])
-    parameters = survey.cases.models[name].parameters
+    parameters = context.cases.models[name].parameters
     return ImpedanceDraws(
         samples=len(pairs),
         stable=sum(rests for _, (rests, _) in pairs),

@@ -27,7 +27,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import friction_states, has_friction
 from seaopt.progress import Progress
-from seaopt.robustness.certificate.cases import Cases, Check, Evidence, Survey
+from seaopt.robustness.certificate.cases import Cases, Check, CheckContext, Evidence
 from seaopt.robustness.certificate.requirement import (
     DESIGN_PLANT,
     KEPT_TO,
@@ -64,9 +64,9 @@ LOG_SECONDS = 0.02  # that the logs of a fit take as a rule
 AMPLITUDES = 9  # looked at for the remark on bandwidth
 
 
-def measure_nominal(survey: Survey, _: Progress) -> Evidence:
+def measure_nominal(context: CheckContext, _: Progress) -> Evidence:
     """Judge every loop at the nominal parameters; the design plant by its own limits too, where the law was tuned."""
-    cases, controller, nominal = survey.cases, survey.cases.controller, survey.cases.unknown.nominal
+    cases, controller, nominal = context.cases, context.cases.controller, context.cases.unknown.nominal
     assert controller.design is not None
     design, values = controller.design
     of_design = values.with_parameters(
@@ -74,9 +74,9 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
     )
     varied = [row.name for row in cases.unknown.varied()]
     figures = {name: close_whole(controller, plant, nominal).figures() for name, plant in cases.plants.items()}
-    of_model = survey.point and not controller.designs_on_response  # else of the response
-    stated = cases.plants if survey.point else {}  # of margins nothing is required, and some take long
-    amplitudes = _remark_amplitude(cases, design) if survey.point else ()
+    of_model = context.point and not controller.designs_on_response  # else of the response
+    stated = cases.plants if context.point else {}  # of margins nothing is required, and some take long
+    amplitudes = _remark_amplitude(cases, design) if context.point else ()
     closed = any(feeds_back(controller, plant) for plant in cases.plants.values())
     return Evidence(
         requirements=(
@@ -87,18 +87,22 @@ def measure_nominal(survey: Survey, _: Progress) -> Evidence:
             "plants": figures,
             "margins": {name: plant_margins(controller, plant, nominal) for name, plant in stated.items()},
         },
-        remarks=(*warn_delays(controller.spec, design, survey.source), *amplitudes, *((WITH_TERMS,) if closed else ())),
+        remarks=(
+            *warn_delays(controller.spec, design, context.source),
+            *amplitudes,
+            *((WITH_TERMS,) if closed else ()),
+        ),
         scope="nominal",
     )
 
 
-def measure_responses(survey: Survey, _: Progress) -> Evidence:
+def measure_responses(context: CheckContext, _: Progress) -> Evidence:
     """Judge the loop on every measured response, of a schedule with the law where it was taken; a law that was designed
     on one by all limits on the first.
     """
     rows, remarks = list[Requirement](), list[str]()
-    for name, response in survey.measured.items():
-        controller, place = _find_law(survey, name, response)
+    for name, response in context.measured.items():
+        controller, place = _find_law(context, name, response)
         scopes: tuple[Scope, ...] = ("every plant",)
         if controller.designs_on_response and not rows:
             scopes = ("design plant", *scopes)
@@ -110,13 +114,15 @@ def measure_responses(survey: Survey, _: Progress) -> Evidence:
     return Evidence(requirements=rows, remarks=tuple(remarks), scope="measured")
 
 
-def _find_law(survey: Survey, name: str, response: MeasuredResponse) -> tuple[Controller, tuple[str, float] | None]:
+def _find_law(
+    context: CheckContext, name: str, response: MeasuredResponse
+) -> tuple[Controller, tuple[str, float] | None]:
     """Return the law that a response is of, and of a schedule the value at which it was taken."""
-    if not survey.places:
-        return survey.cases.controller, None
-    source, schedule = survey.source, survey.schedule
+    if not context.places:
+        return context.cases.controller, None
+    source, schedule = context.source, context.schedule
     fitted = source.parameters if isinstance(source, Fit) else source
-    values, (first, *_, last) = survey.supplement.with_parameters(*fitted.values()), schedule.points
+    values, (first, *_, last) = context.supplement.with_parameters(*fitted.values()), schedule.points
     taken_at = find_response_place(schedule.over, name, response, values)
     if not first <= taken_at <= last:
         raise ControlError(
@@ -126,16 +132,16 @@ def _find_law(survey: Survey, name: str, response: MeasuredResponse) -> tuple[Co
     return schedule.at(taken_at), (schedule.over, taken_at)
 
 
-def judge_logs(survey: Survey, _: Progress) -> Evidence:
+def judge_logs(context: CheckContext, _: Progress) -> Evidence:
     """Judge the law on every log of the fit that is of one of its plants, and was taken where a schedule stands."""
-    controller, fit = survey.cases.controller, survey.source
+    controller, fit = context.cases.controller, context.source
     limit = controller.spec.level("max_sensitivity")
     if limit is None or not isinstance(fit, Fit):
         return Evidence()
-    names = {plant.name for plant in survey.cases.models.values()}
+    names = {plant.name for plant in context.cases.models.values()}
     logs = [each for each in (*fit.experiments, *fit.validation) if each.plant.name in names]
-    if survey.place is not None:
-        logs = [each for each in logs if np.isclose(_find_log_place(survey.place[0], fit, each), survey.place[1])]
+    if context.place is not None:
+        logs = [each for each in logs if np.isclose(_find_log_place(context.place[0], fit, each), context.place[1])]
     found = [judge_log(controller, fit, experiment, limit) for experiment in logs]
     verdicts = tuple(verdict for of_log, _ in found for verdict in of_log)
     rows = (
@@ -150,7 +156,7 @@ def judge_logs(survey: Survey, _: Progress) -> Evidence:
         for each in verdicts
     )
     remarks = [SILENT[silent.why].format(silent) for _, silent in found if silent is not None]
-    if fit.experiments and not logs and survey.place is None:
+    if fit.experiments and not logs and context.place is None:
         remarks.append(NO_LOG)
     return Evidence(requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remarks), scope="measured")
 
@@ -179,9 +185,9 @@ NOMINAL = Check(measure=measure_nominal, brief=lambda _: True)
 LOGS = Check(
     measure=judge_logs,
     seconds=lambda _: LOG_SECONDS,
-    applies=lambda survey: bool(survey.cases.models) and isinstance(survey.source, Fit),
+    applies=lambda context: bool(context.cases.models) and isinstance(context.source, Fit),
 )
-MEASURED = Check(measure=measure_responses, applies=lambda survey: bool(survey.measured))
+MEASURED = Check(measure=measure_responses, applies=lambda context: bool(context.measured))
 
 
 def design_requirements(

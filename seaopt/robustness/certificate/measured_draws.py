@@ -21,7 +21,7 @@ from seaopt.executors import Shared, map_ordered
 from seaopt.progress import Progress, divide
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket, bracket
-from seaopt.robustness.certificate.cases import Cases, Check, Draw, Evidence, Survey
+from seaopt.robustness.certificate.cases import Cases, Check, CheckContext, Draw, Evidence
 from seaopt.robustness.certificate.requirement import UNSTABLE_LOOP, DrawnAt, Requirement, Spot, require_at_most
 from seaopt.robustness.uncertainty.batch import DRAW_BLOCK, BatchFigures, batch_figures
 from seaopt.robustness.uncertainty.draws import Column, Points
@@ -54,14 +54,14 @@ class _Tally:
         return take_rows(both, np.argsort(both.severity)[::-1][:WORST_KEPT])
 
 
-def measure_uncertainty(survey: Survey, progress: Progress) -> Evidence:
+def measure_uncertainty(context: CheckContext, progress: Progress) -> Evidence:
     """Return what the draws say, and the worst cases from them and a search."""
-    drawing, searching = divide(progress, *_list_seconds(survey))
-    failed, drawn, drawn_ms = measure_draws(survey.shared, survey.samples, survey.drawing, survey.executor, drawing)
-    worst, brackets = search_worst(survey.shared, drawn, survey.executor, searching)
-    options = survey.options
-    counts, by_spot = count_failures(failed, options.seed, options.confidence), name_worst(survey, worst)
-    rows = () if survey.place else draw_requirements(counts, by_spot, options.max_failure_probability)
+    drawing, searching = divide(progress, *_list_seconds(context))
+    failed, drawn, drawn_ms = measure_draws(context.shared, context.samples, context.drawing, context.executor, drawing)
+    worst, brackets = search_worst(context.shared, drawn, context.executor, searching)
+    options = context.options
+    counts, by_spot = count_failures(failed, options.seed, options.confidence), name_worst(context, worst)
+    rows = () if context.place else draw_requirements(counts, by_spot, options.max_failure_probability)
     return Evidence(
         requirements=rows,
         fields={"monte_carlo": counts, "worst": worst, "brackets": brackets, "drawn_ms": drawn_ms},
@@ -70,20 +70,20 @@ def measure_uncertainty(survey: Survey, progress: Progress) -> Evidence:
     )
 
 
-def name_worst(survey: Survey, worst: Mapping[str, Worst]) -> dict[Spot, Worst]:
+def name_worst(context: CheckContext, worst: Mapping[str, Worst]) -> dict[Spot, Worst]:
     """Return the worst case of each plant by where it is."""
-    spots = survey.cases.spots
-    return {spots[name]._replace(place=survey.place): case for name, case in worst.items()}
+    spots = context.cases.spots
+    return {spots[name]._replace(place=context.place): case for name, case in worst.items()}
 
 
-def _list_seconds(survey: Survey) -> tuple[float, float]:
-    plants, bounded = len(survey.cases.plants), survey.cases.bounds is not None
-    return DRAW * survey.samples * plants, (SEARCH + BOUND * bounded) * plants
+def _list_seconds(context: CheckContext) -> tuple[float, float]:
+    plants, bounded = len(context.cases.plants), context.cases.bounds is not None
+    return DRAW * context.samples * plants, (SEARCH + BOUND * bounded) * plants
 
 
 DRAWS = Check(
     measure=measure_uncertainty,
-    seconds=lambda survey: sum(_list_seconds(survey)),
+    seconds=lambda context: sum(_list_seconds(context)),
     applies=lambda _: True,
     brief=lambda _: True,
 )
@@ -174,7 +174,7 @@ def _search_plant(cases: Shared[Cases], part: tuple[str, Points]) -> tuple[Worst
 
 
 def judge_draws(
-    survey: Survey,
+    context: CheckContext,
     most: int,
     judges: Mapping[str, Callable[[Shared[Cases], str, Sequence[Draw]], Sequence[Case]]],
     nominal: Sequence[Draw] = (),
@@ -182,15 +182,15 @@ def judge_draws(
     """Return what the judgement of each plant makes of draws, the same for all, and of what is `nominal` before them:
     pairs of what the plant has of a draw and of what is made of it. What does not differ in that is judged once.
     """
-    count, models, unknown = min(survey.samples, most), survey.cases.models, survey.cases.unknown
-    draws = [*nominal, *(unknown.list_draws(count, survey.rng) if count and judges else ())]
+    count, models, unknown = min(context.samples, most), context.cases.models, context.cases.unknown
+    draws = [*nominal, *(unknown.list_draws(count, context.rng) if count and judges else ())]
     made: dict[str, list[tuple[Draw, Case]]] = {}
     for name, judge in judges.items() if draws else ():
         has = place_values(models[name], unknown.nominal, draws[-1])
         of_plant: list[Draw] = [{key: value for key, value in draw.items() if key in has} for draw in draws]
         distinct = list({tuple(draw.items()): draw for draw in of_plant}.values())
         parts = (distinct[k : k + DRAWS_PER_PART] for k in range(0, len(distinct), DRAWS_PER_PART))
-        judged = map_ordered(partial(judge, survey.shared, name), parts, survey.executor)
+        judged = map_ordered(partial(judge, context.shared, name), parts, context.executor)
         cases = zip(distinct, (case for part in judged for case in part), strict=True)
         found = {tuple(draw.items()): case for draw, case in cases}
         made[name] = [(draw, found[tuple(draw.items())]) for draw in of_plant]

@@ -33,7 +33,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, count_off
 from seaopt.robustness.bounds.stretch import PLACE, StretchBound, bound_stretch, place_plant
-from seaopt.robustness.certificate.cases import Check, Evidence, Survey
+from seaopt.robustness.certificate.cases import Check, CheckContext, Evidence
 from seaopt.robustness.certificate.measured_draws import draw_requirements, name_worst
 from seaopt.robustness.certificate.requirement import Requirement, Spot, require_at_least, require_at_most
 from seaopt.robustness.uncertainty.failure_probability import join_counts
@@ -50,24 +50,24 @@ TERMS_CHANGE = "what is compensated changes with a state of the plant on the str
 BOUND, SWEEP = 0.2, 5.0  # seconds that a stretch, and the sweeps of a plant, take as a rule
 
 
-def measure_stretches(survey: Survey, progress: Progress) -> Evidence:
+def measure_stretches(context: CheckContext, progress: Progress) -> Evidence:
     """Bound Ms between neighbouring values, on every plant; what the tuner found there is what is required."""
-    values = [survey.place[1] for survey in survey.places if survey.place is not None]
-    pairs, schedule, cases = list(pairwise(values)), survey.schedule, survey.cases
+    values = [context.place[1] for context in context.places if context.place is not None]
+    pairs, schedule, cases = list(pairwise(values)), context.schedule, context.cases
     shared = Shared((schedule, dict(cases.models)))
-    bounds = map_ordered(partial(_bound_plants, shared, cases.unknown.nominal), pairs, survey.executor)
+    bounds = map_ordered(partial(_bound_plants, shared, cases.unknown.nominal), pairs, context.executor)
     stretches = tuple(bound for _ in count_off(pairs, "stretch", progress) for bound in next(bounds))
     rows = [*_require_limits_between(schedule), *_refute_limits_between(schedule, stretches)]
     return Evidence(requirements=rows, fields={"stretches": stretches}, scope="nominal")
 
 
-def join_places(survey: Survey, _: Progress) -> Evidence:
+def join_places(context: CheckContext, _: Progress) -> Evidence:
     """Count the draws of all values together, require the worst of all, and return each plant at its worst place."""
-    places: Sequence[Certificate] = survey.found["places"]
+    places: Sequence[Certificate] = context.found["places"]
     counts, worst = join_counts([certificate.monte_carlo for certificate in places]), dict[Spot, Worst]()
-    for at, certificate in zip(survey.places, places, strict=True):
+    for at, certificate in zip(context.places, places, strict=True):
         worst |= name_worst(at, certificate.worst)
-    rows = draw_requirements(counts, worst, survey.options.max_failure_probability)
+    rows = draw_requirements(counts, worst, context.options.max_failure_probability)
     fields = {"monte_carlo": counts, **take_worst(places)}
     return Evidence(requirements=rows, fields=fields, scope="drawn", risk=counts.risk)
 
@@ -85,12 +85,12 @@ def take_worst(places: Sequence[Certificate]) -> dict[str, Any]:
     }
 
 
-def measure_sweeps(survey: Survey, progress: Progress) -> Evidence:
+def measure_sweeps(context: CheckContext, progress: Progress) -> Evidence:
     """Simulate sweeps of the variable on every plant, and plants that move it themselves."""
-    schedule, models, nominal = survey.schedule, survey.cases.models, survey.cases.unknown.nominal
-    least, sweeps = survey.options.min_rate, dict[str, tuple[Sweep, ...]]()
-    for name in count_off(list(models), "sweeps, plant", progress) if survey.simulations else ():
-        of_plant = sweep_schedule(schedule, name, models[name], nominal, executor=survey.executor)
+    schedule, models, nominal = context.schedule, context.cases.models, context.cases.unknown.nominal
+    least, sweeps = context.options.min_rate, dict[str, tuple[Sweep, ...]]()
+    for name in count_off(list(models), "sweeps, plant", progress) if context.simulations else ():
+        of_plant = sweep_schedule(schedule, name, models[name], nominal, executor=context.executor)
         sweeps |= {name: of_plant} if of_plant else {}
     motions: dict[str, Motion] = {}
     if sweeps:
@@ -110,10 +110,10 @@ def measure_sweeps(survey: Survey, progress: Progress) -> Evidence:
 
 
 STRETCHES = Check(
-    measure=measure_stretches, seconds=lambda survey: BOUND * len(survey.places) * len(survey.cases.models)
+    measure=measure_stretches, seconds=lambda context: BOUND * len(context.places) * len(context.cases.models)
 )
 JOINT_DRAWS = Check(measure=join_places, brief=lambda _: True)
-SWEEPS = Check(measure=measure_sweeps, seconds=lambda survey: SWEEP * survey.simulations * len(survey.cases.models))
+SWEEPS = Check(measure=measure_sweeps, seconds=lambda context: SWEEP * context.simulations * len(context.cases.models))
 
 
 def _bound_plants(

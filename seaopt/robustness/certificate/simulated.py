@@ -26,7 +26,7 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction, split_friction
 from seaopt.progress import Progress, divide, ignore
 from seaopt.records import Result, Worded, record
-from seaopt.robustness.certificate.cases import Cases, Check, Evidence, Survey
+from seaopt.robustness.certificate.cases import Cases, Check, CheckContext, Evidence
 from seaopt.robustness.certificate.requirement import LIMIT_CYCLE, DrawnAt, Requirement, require_at_most
 from seaopt.robustness.uncertainty.draws import Plants, Varied
 from seaopt.robustness.uncertainty.worst import Worst
@@ -94,11 +94,11 @@ class Simulated(Result, Worded):
         return self.passivity.to_dict() | {"environments": self.environments.to_dict()}
 
 
-def measure_steps(survey: Survey, progress: Progress) -> Evidence:
+def measure_steps(context: CheckContext, progress: Progress) -> Evidence:
     """Play steps of several sizes on every plant, at its worst draws too, and look for limit cycles."""
-    cases, unknown, found = survey.cases, survey.cases.unknown, survey.found
-    models = select_simulated(cases.models, survey.place)
-    devices = {} if survey.simulations else survey.devices  # else those scenarios, steps among them, have them
+    cases, unknown, found = context.cases, context.cases.unknown, context.found
+    models = select_simulated(cases.models, context.place)
+    devices = {} if context.simulations else context.devices  # else those scenarios, steps among them, have them
     try:
         steps: Verification | str = verify(
             cases.controller,
@@ -106,9 +106,9 @@ def measure_steps(survey: Survey, progress: Progress) -> Evidence:
             unknown.nominal,
             scenarios=step_scenarios,
             draws=list_worst_draws(models, unknown.nominal, unknown.varied(), found["worst"]),
-            executor=survey.executor,
+            executor=context.executor,
             progress=progress,
-            seed=survey.options.seed,
+            seed=context.options.seed,
             **devices,
         )
     except SeaoptError as error:
@@ -116,7 +116,7 @@ def measure_steps(survey: Survey, progress: Progress) -> Evidence:
     shown = {name: name not in found["friction"] or found["friction"][name].shown for name in models}
     cycles: dict[str, tuple[FoundCycle, ...]] = {}
     for name, seen in zip(
-        shown, map_ordered(partial(_seek, survey.shared), shown.items(), survey.executor), strict=True
+        shown, map_ordered(partial(_seek, context.shared), shown.items(), context.executor), strict=True
     ):
         if seen or not shown[name]:
             ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
@@ -127,38 +127,38 @@ def measure_steps(survey: Survey, progress: Progress) -> Evidence:
         for cycle in seen
         if cycle.predicted is not None and cycle.lasts
     )
-    rows = () if survey.simulations else require_runs(steps)  # else those scenarios are judged
+    rows = () if context.simulations else require_runs(steps)  # else those scenarios are judged
     return Evidence(requirements=(*lasting, *rows), fields={"steps": steps, "cycles": cycles}, scope="simulated")
 
 
-def measure_simulations(survey: Survey, progress: Progress) -> Evidence:
+def measure_simulations(context: CheckContext, progress: Progress) -> Evidence:
     """Play every scenario on the nonlinear plants, at their worst draws too."""
-    cases, unknown, steps = survey.cases, survey.cases.unknown, survey.found.get("steps")
-    models = select_simulated(cases.models, survey.place)
+    cases, unknown, steps = context.cases, context.cases.unknown, context.found.get("steps")
+    models = select_simulated(cases.models, context.place)
     simulated = run_simulations(
         cases.controller,
         models,
         unknown.nominal,
-        draws=list_worst_draws(models, unknown.nominal, unknown.varied(), survey.found["worst"]),
-        seed=survey.options.seed,
+        draws=list_worst_draws(models, unknown.nominal, unknown.varied(), context.found["worst"]),
+        seed=context.options.seed,
         steps=steps if isinstance(steps, Verification) else None,
-        large_signals=survey.large_signals,
-        executor=survey.executor,
+        large_signals=context.large_signals,
+        executor=context.executor,
         progress=progress,
-        **survey.devices,
+        **context.devices,
     )
     return Evidence(requirements=require_simulated(simulated), fields={"simulated": simulated}, scope="simulated")
 
 
 STEPS = Check(
     measure=measure_steps,
-    seconds=lambda survey: STEP_SECONDS * len(survey.cases.models),
-    applies=lambda survey: survey.steps,
+    seconds=lambda context: STEP_SECONDS * len(context.cases.models),
+    applies=lambda context: context.steps,
 )
 SIMULATIONS = Check(
     measure=measure_simulations,
-    seconds=lambda survey: SECONDS * len(survey.cases.models),
-    applies=lambda survey: survey.steps and survey.simulations,
+    seconds=lambda context: SECONDS * len(context.cases.models),
+    applies=lambda context: context.steps and context.simulations,
 )
 
 
@@ -288,7 +288,7 @@ def require_runs(runs: Verification | str) -> list[Requirement]:
     if isinstance(runs, str):
         return [require_at_most(SIMULATION_FAILURES, np.inf, 0.0, text=runs)]
     requirements: list[Requirement] = []
-    for plant in runs.stages:
+    for plant in runs.rigs:
         rows = [row for row in runs.rows if row.plant == plant]
         requirements += [*_list_failures(runs, rows), *_list_kept(runs, plant, rows)]
     return requirements

@@ -45,7 +45,7 @@ from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.limit_cycles import FoundCycle
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
-from seaopt.robustness.verification.verification import Verification, make_stages
+from seaopt.robustness.verification.verification import Verification, make_rigs
 
 FILE, CERTIFY_AGAIN = "robustness.json", "certify again"
 SAME_FIGURES = 1e-5  # of Ms and Mt, below which the loop that a file is of is the one that is closed today
@@ -285,8 +285,8 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     draws = {name: (certificate.parameters, *drawn) for name, drawn in certificate.list_draws().items()}
 
     def restore(rows: Mapping[str, Any], sensors: Sensors | None, command_step: float) -> Verification | None:
-        stages = make_stages(certificate.controller, certificate.simulated_models, sensors, command_step)
-        return Verification.from_dict(rows, stages, draws, FILE, CERTIFY_AGAIN) if "rows" in rows else None
+        rigs = make_rigs(certificate.controller, certificate.simulated_models, sensors, command_step)
+        return Verification.from_dict(rows, rigs, draws, FILE, CERTIFY_AGAIN) if "rows" in rows else None
 
     devices = (None, 0.0) if runs is None else (runs.sensors, runs.command_step)
     steps = restore(stored.steps, *devices) if "rows" in stored.steps else stored.steps.get("left_out")

@@ -23,7 +23,7 @@ from seaopt.plants.plant import output_function
 from seaopt.records import record
 from seaopt.robustness.verification.judgement import find_saturated, take_ends
 from seaopt.robustness.verification.oscillation import Signal
-from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.playback import Rig, play
 from seaopt.robustness.verification.scenarios import NOMINAL_EFFORT, Phase, Scenario
 
 SHARES = (0.05, 0.5)  # of the effort that the current limit holds at rest
@@ -70,7 +70,7 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
         return ()
     motion, completed = str(plant.port.motion), plant.complete(params)
     # A gate that gives its sensor up lets the link hang, which would pass for rest.
-    stage = Stage(controller=replace(controller, gate=None), plant=plant)
+    rig = Rig(controller=replace(controller, gate=None), plant=plant)
     samples, farthest = _count_samples(controller, plant, completed), _find_farthest(plant, completed)
     holding, dry = controller.force_limit(0.0), sum(find_dry_friction(plant, completed).values())
     efforts = [NOMINAL_EFFORT[controller.command.mechanics]]  # N or N m, that a step asks for at once
@@ -83,8 +83,8 @@ def play_impedance_steps(controller: Controller, plant: Plant, params: Parameter
         size = min(effort / outer.stiffness, farthest)
         push = Phase(duration_s=samples * outer.sample_time_s, force_N=outer.direction * outer.stiffness * size)
         scenario = Scenario(name="step of x_0", phases=(push,), friction="sticking" if can_stick(plant) else "smooth")
-        run = play(stage, scenario, [params])
-        saturated = find_saturated(run.current, stage.law.command_limit) > 0.0
+        run = play(rig, scenario, [params])
+        saturated = find_saturated(run.current, rig.law.command_limit) > 0.0
         steps.append(_measure(run.outputs[motion][0], size, saturated))
     return tuple(steps)
 

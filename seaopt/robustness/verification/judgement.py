@@ -46,7 +46,7 @@ from seaopt.plants.friction import find_locked_modes
 from seaopt.records import Result, record
 from seaopt.robustness.verification.linear import LinearView, linearise_last_phase
 from seaopt.robustness.verification.oscillation import Signal, find_oscillation
-from seaopt.robustness.verification.playback import Playback, Stage
+from seaopt.robustness.verification.playback import Playback, Rig
 from seaopt.robustness.verification.scenarios import SETTLED, Scenario
 
 SETTLE = 0.2  # of the last phase, which is not judged
@@ -195,7 +195,7 @@ def find_saturated(command: Float[np.ndarray, "..."], limit: float) -> float:
 class _TraceRun:
     """One run of a trace."""
 
-    stage: Stage
+    rig: Rig
     scenario: Scenario
     trace: Playback
     index: int
@@ -203,12 +203,12 @@ class _TraceRun:
     @property
     def regulated(self) -> str:
         """Name of the output that the law regulates."""
-        return self.stage.controller.spec.regulated
+        return self.rig.controller.spec.regulated
 
     @property
     def unit(self) -> str:
         """Unit of that output."""
-        return self.stage.controller.command.reference_unit
+        return self.rig.controller.command.reference_unit
 
     @property
     def force(self) -> Signal:
@@ -246,7 +246,7 @@ class _TraceRun:
 
 
 def judge_run(
-    stage: Stage,
+    rig: Rig,
     name: str,
     scenario: Scenario,
     trace: Playback,
@@ -256,12 +256,12 @@ def judge_run(
     unlimited: Playback | None = None,
 ) -> Outcome:
     """Return the outcome of one run of a trace, played on the plant `name` with `sets`, nominal first. `twin` is the
-    same scenario on `stage.ideal`; the trace itself where the stage is ideal. `unlimited` is that one without a current
+    same scenario on `rig.ideal`; the trace itself where the rig is ideal. `unlimited` is that one without a current
     limit, where it `overshoots_at_limit`.
     """
     judge, drawn, nominal = Judge(), sets[index], sets[0]
-    view = linearise_last_phase(stage, scenario, drawn)
-    run = _TraceRun(stage=stage, scenario=scenario, trace=trace, index=index)
+    view = linearise_last_phase(rig, scenario, drawn)
+    run = _TraceRun(rig=rig, scenario=scenario, trace=trace, index=index)
     ideal = replace(run, trace=twin)
     finite = all(np.all(np.isfinite(signal)) for signal in (run.force, trace.current[index], ideal.force))
     judge.refuse("overflow", "" if finite else "its numbers overflow")
@@ -289,11 +289,11 @@ def judge_run(
 
 
 def _judge_extremes(run: _TraceRun, judge: Judge) -> None:
-    scenario, trace, index, command = run.scenario, run.trace, run.index, run.stage.controller.command
+    scenario, trace, index, command = run.scenario, run.trace, run.index, run.rig.controller.command
     force = float(trace.peaks[run.regulated][index])
-    angles = [float(trace.peaks[name][index]) for name, unit in run.stage.plant.outputs.items() if unit == "rad"]
-    current, limit = float(np.max(np.abs(trace.current[index]))), run.stage.controller.command_limit
-    most = largest_current(math.inf if limit is None else limit, run.stage.command_step)
+    angles = [float(trace.peaks[name][index]) for name, unit in run.rig.plant.outputs.items() if unit == "rad"]
+    current, limit = float(np.max(np.abs(trace.current[index]))), run.rig.controller.command_limit
+    most = largest_current(math.inf if limit is None else limit, run.rig.command_step)
     hardest = max(trace.contacts, key=lambda contact: abs(contact.impulse[index]), default=None)
     judge.figures.update(
         peak_force_N=force,
@@ -323,11 +323,11 @@ def _judge_extremes(run: _TraceRun, judge: Judge) -> None:
 
 def _judge_rest(run: _TraceRun, drawn: ParameterSet, judge: Judge) -> None:
     """Check that the motor can hold the plant where the draw puts it at rest."""
-    start, limit, command = run.trace.equilibrium, run.stage.controller.command_limit, run.stage.controller.command
+    start, limit, command = run.trace.equilibrium, run.rig.controller.command_limit, run.rig.controller.command
     if start is None or limit is None:
         return
     takes = abs(float(start.current_A[run.index]))
-    where = format_values({name: drawn[name].value for name in run.stage.plant.states if name in drawn}, missing="")
+    where = format_values({name: drawn[name].value for name in run.rig.plant.states if name in drawn}, missing="")
     taken = command.show(float(start.current_A[run.index]))
     text = f"to rest at {where} takes {taken}, above the limit of {command.show(limit)}"
     judge.require("rest", takes, limit * (1.0 + ABOVE_LIMIT), text, command.unit, remedy="narrow its range")
@@ -367,16 +367,16 @@ def _judge_outbreak(run: _TraceRun, ideal: _TraceRun, view: LinearView, judge: J
 
 def _judge_oscillation(run: _TraceRun, drawn: ParameterSet, view: LinearView, judge: Judge) -> None:
     """Check that no oscillation lasts: a slow one in a long window, one whose phase noise moves in a short one."""
-    stage, scenario = run.stage, run.scenario
-    band, period = stage.controller.spec.bandwidth_hz, stage.controller.sample_time_s
-    free = stage.plant.moves and not scenario.phases[-1].held
+    rig, scenario = run.rig, run.scenario
+    band, period = rig.controller.spec.bandwidth_hz, rig.controller.sample_time_s
+    free = rig.plant.moves and not scenario.phases[-1].held
     # A window long enough for the slowest oscillation, and a short one, where noise moves fast phases less.
     last, slow = find_judged_window(run.trace), max(LEAST_WINDOW_S, LINE_PERIODS * SLOWEST / band)
     for length in (math.ceil(duration / period) for duration in (slow, slow / SHORTER)):
         window = slice(max(last.start, last.stop - length), last.stop)
         lasting = period * (window.stop - window.start)
         lowest = max(band / SLOWEST, LINE_PERIODS / lasting) if free else STILL_PERIODS / lasting
-        floor = find_noise_floor(stage, float(run.trace.peaks[run.regulated][run.index]), view, lowest)
+        floor = find_noise_floor(rig, float(run.trace.peaks[run.regulated][run.index]), view, lowest)
         if scenario.settling_s is not None:  # what creeps against friction is no pure exponential
             floor = max(floor, VISIBLE * abs(run.step))
         line = find_oscillation(run.force[window], period, floor=floor, lowest_hz=lowest)
@@ -392,9 +392,9 @@ def _judge_oscillation(run: _TraceRun, drawn: ParameterSet, view: LinearView, ju
 
 def _swings_alone(run: _TraceRun, drawn: ParameterSet, frequency_hz: float) -> bool:
     """Tell whether a moving plant has a mode at a frequency while its joints stick, which no law can then damp."""
-    if run.scenario.friction == "smooth" or not run.stage.plant.moves:
+    if run.scenario.friction == "smooth" or not run.rig.plant.moves:
         return False
-    modes = find_locked_modes(run.stage.plant, drawn)
+    modes = find_locked_modes(run.rig.plant, drawn)
     return bool(np.any(np.abs(modes / frequency_hz - 1.0) < SAME_FREQUENCY))
 
 
@@ -404,23 +404,23 @@ def find_judged_window(trace: Playback) -> slice:
     return slice(last.start + int(SETTLE * (last.stop - last.start)), last.stop)
 
 
-def find_noise_floor(stage: Stage, peak: float, view: LinearView, lowest_hz: float) -> float:
+def find_noise_floor(rig: Rig, peak: float, view: LinearView, lowest_hz: float) -> float:
     """Return the amplitude (N) above a frequency that noise, quantisation and rounding make without an oscillation in a
     run's peak; of an unstable loop there is no telling what it makes of them.
     """
-    rounding = 0.5 * stage.command_step / stage.controller.command.per_effort
-    std, step = stage.reading_errors
+    rounding = 0.5 * rig.command_step / rig.controller.command.per_effort
+    std, step = rig.reading_errors
     noise = 0.0 if view.instability else LINE_SIGMAS * view.force_std(lowest_hz)
     return max(2.0 * std + 1.5 * step + rounding, 1e-3 * peak, noise)
 
 
-def overshoots_at_limit(stage: Stage, scenario: Scenario, trace: Playback) -> bool:
+def overshoots_at_limit(rig: Rig, scenario: Scenario, trace: Playback) -> bool:
     """Tell whether a step overshoots further than is allowed in a run whose current reaches its limit."""
-    limit, allowed = stage.controller.command_limit, scenario.max_overshoot
+    limit, allowed = rig.controller.command_limit, scenario.max_overshoot
     if limit is None or allowed is None:
         return False
     at_limit = (index for index, current in enumerate(trace.current) if find_saturated(current, limit))
-    runs = (_TraceRun(stage=stage, scenario=scenario, trace=trace, index=index) for index in at_limit)
+    runs = (_TraceRun(rig=rig, scenario=scenario, trace=trace, index=index) for index in at_limit)
     return any(run.largest > allowed for run in runs)
 
 
@@ -430,7 +430,7 @@ def _judge_step(run: _TraceRun, most_s: float, judge: Judge, unlimited: Playback
     outside = np.flatnonzero(np.abs(run.response[last] - 1.0) > SETTLED)
     settled = outside.size == 0 or outside[-1] + 1 < last.stop - last.start
     samples = float(outside[-1] + 1 if outside.size else 0) if settled else math.inf
-    settling_s = samples * run.stage.controller.sample_time_s
+    settling_s = samples * run.rig.controller.sample_time_s
     judge.figures.update(overshoot=max(largest - 1.0, 0.0), settling_s=settling_s)
     step = f"a step of {run.step:.3g} {run.unit}"
     if allowed is not None and largest > allowed and unlimited is not None:
@@ -445,14 +445,14 @@ def _judge_step(run: _TraceRun, most_s: float, judge: Judge, unlimited: Playback
 
 
 def _judge_final_error(run: _TraceRun, ideal: _TraceRun, judge: Judge) -> None:
-    last, stage, most = run.trace.last, run.stage, run.scenario.final_error
+    last, rig, most = run.trace.last, run.rig, run.scenario.final_error
     judged = max(1, (last.stop - last.start) // 5)
     error, alone = (float(np.mean(take_ends(each.error, [last.stop], judged))) for each in (run, ideal))
     judge.figures["final_error_N"] = error
     if most is None:
         return
-    called, (noise, count) = stage.controller.command.mechanics, stage.reading_errors
-    rounding = stage.command_step / stage.controller.command.per_effort
+    called, (noise, count) = rig.controller.command.mechanics, rig.reading_errors
+    rounding = rig.command_step / rig.controller.command.per_effort
     spare = MEAN_SIGMAS * noise / math.sqrt(judged) + 0.5 * (count + rounding)
     noisy = not abs(error) <= most + spare
     value, allowed, what = (error, most + spare, "") if noisy else (alone, most, " without noise")

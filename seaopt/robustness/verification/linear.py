@@ -19,7 +19,7 @@ from seaopt.control.loops.loop import GROWING, STABLE, Loop
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
-from seaopt.robustness.verification.playback import Stage, apply_load
+from seaopt.robustness.verification.playback import Rig, apply_load
 from seaopt.robustness.verification.scenarios import Scenario
 
 REAL = 1e-12  # rad a sample: an eigenvalue of a smaller angle is real but for rounding
@@ -61,27 +61,27 @@ class LinearView:
         return math.sqrt(float(np.trapezoid(power, f)) / self.loop.plant.nyquist_hz)
 
 
-def linearise_last_phase(stage: Stage, scenario: Scenario, drawn: ParameterSet) -> LinearView:
+def linearise_last_phase(rig: Rig, scenario: Scenario, drawn: ParameterSet) -> LinearView:
     """Return the linear loop of a scenario's last phase, with the load and the link as they are then. It is that of the
     plant at rest, where the phase ends, with friction as steep as it is there; what the loop does in motion the
     simulation shows. `drawn` has the parameters and conditions of the run.
     """
     last = scenario.phases[-1]
-    plant = stage.partner if last.held and stage.partner is not None else stage.plant
+    plant = rig.partner if last.held and rig.partner is not None else rig.plant
     params = drawn.with_parameters(*plant.complete(drawn).values())
     for phase in scenario.phases:
         params = apply_load(params, {name: factor for name, factor in phase.scale.items() if name in plant.parameters})
-    return view_loop(stage, plant, params)
+    return view_loop(rig, plant, params)
 
 
-def view_loop(stage: Stage, plant: Plant, params: ParameterSet) -> LinearView:
-    """Return the linear loop on a plant at rest, with the noise of a stage's devices."""
-    controller, outer = stage.controller, stage.controller.outer
+def view_loop(rig: Rig, plant: Plant, params: ParameterSet) -> LinearView:
+    """Return the linear loop on a plant at rest, with the noise of a rig's devices."""
+    controller, outer = rig.controller, rig.controller.outer
     enclosed = enclose(controller, plant)
     return LinearView(
         loop=close(controller, plant, params, enclosed),
-        noise=tuple(_combine_std(*stage.find_errors(name)) for name in enclosed[1]),
-        step_N=_combine_std(0.0, stage.command_step / controller.command.per_effort),
+        noise=tuple(_combine_std(*rig.find_errors(name)) for name in enclosed[1]),
+        step_N=_combine_std(0.0, rig.command_step / controller.command.per_effort),
         drifts=outer is not None and not outer.stiffness,
     )
 

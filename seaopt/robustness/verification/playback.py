@@ -31,7 +31,7 @@ RunSamples = Float[np.ndarray, "runs n"]
 
 
 @record(eq=False)
-class Stage:
+class Rig:
     """Controller, plant and devices that scenarios are simulated on."""
 
     controller: Controller
@@ -57,13 +57,13 @@ class Stage:
         return runnable(self.controller, outer=True)
 
     @property
-    def ideal(self) -> Stage:
-        """The stage with a sensor and an amplifier that only have a range: no noise, no offset, no steps."""
+    def ideal(self) -> Rig:
+        """The rig with a sensor and an amplifier that only have a range: no noise, no offset, no steps."""
         return replace(self, sensors=Sensors(saturation=self.sensors.saturation), command_step=0.0)
 
     @property
-    def unlimited(self) -> Stage:
-        """The stage with no limit of the command."""
+    def unlimited(self) -> Rig:
+        """The rig with no limit of the command."""
         spec = replace(self.controller.spec, current_limit_A=None, command_limit=None)
         command = replace(self.controller.command, largest=None)
         return replace(self, controller=replace(self.controller, spec=spec, command=command, derate=False))
@@ -127,7 +127,7 @@ class Playback:
         return slice(self.edges[-2], self.edges[-1])
 
 
-def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, seed: int = 1) -> Playback:
+def play(rig: Rig, scenario: Scenario, params: Sequence[ParameterSet], *, seed: int = 1) -> Playback:
     """Simulate a scenario, once for each set of parameters. A run starts at rest: at zero, or where a condition among
     its parameters (an angle such as phi) puts the plant, with the law and the commands that wait at rest too, and the
     scenario's forces counted from the one that keeps it there. A scenario with an `initial_state` starts in that,
@@ -135,19 +135,19 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     noise and of random excitations. Around an outer loop a force of a phase is the x_0 that its stiffness makes it of;
     without a stiffness it is added to what that asks for.
     """
-    obstacle = scenario.obstacle(stage.plant, stage.partner)
+    obstacle = scenario.obstacle(rig.plant, rig.partner)
     if obstacle is not None:
-        raise ControlError(f'scenario "{scenario.name}" cannot be played on {stage.plant.name}: {obstacle}')
+        raise ControlError(f'scenario "{scenario.name}" cannot be played on {rig.plant.name}: {obstacle}')
     if not params:
         raise ControlError("params is empty; give one ParameterSet per run")
-    placed = [stage.plant.complete(stage.controller.delay(drawn)) for drawn in params]
+    placed = [rig.plant.complete(rig.controller.delay(drawn)) for drawn in params]
     delays = [[drawn.given[name] for name in DELAYS if name in drawn.given] for drawn in placed]
-    longest = find_longest_delay(stage.plant, placed)
+    longest = find_longest_delay(rig.plant, placed)
     carried = [drawn.with_parameters(*delay) for drawn, delay in zip(placed, delays, strict=True)]
-    start = None if scenario.initial_state else equilibrium(stage.loop(held=False, longest_delay_s=longest), placed)
-    now, grip = _start_state(stage, scenario, placed, longest) if start is None else start.state, None
+    start = None if scenario.initial_state else equilibrium(rig.loop(held=False, longest_delay_s=longest), placed)
+    now, grip = _start_state(rig, scenario, placed, longest) if start is None else start.state, None
     offset = start.given[:, None] if start is not None and scenario.about_rest else np.zeros((len(params), 1))
-    outer = stage.law.outer
+    outer = rig.law.outer
     per_force = 1.0 if outer is None else 1.0 / outer.per_given
     runs: list[LoopRun] = []
     positions: list[RunSamples] = []  # of the link, as the outer loop reads it
@@ -155,23 +155,23 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
     begin_s = 0.0
     for number, phase in enumerate(scenario.phases):
         carried = [apply_load(unloaded, phase.scale) for unloaded in carried]
-        values = [stage.plant.complete(loaded) for loaded in carried]
+        values = [rig.plant.complete(loaded) for loaded in carried]
         if phase.held and grip is None:
-            now, grip, contact = _catch(stage, values, now)
+            now, grip, contact = _catch(rig, values, now)
             contacts.append(contact)
         elif grip is not None and not phase.held:
-            port, rows = _port(stage.plant), zip(now.x, values, grip, strict=True)
-            freed = [release(stage.plant, p, port, row, link) for row, p, link in rows]
+            port, rows = _port(rig.plant), zip(now.x, values, grip, strict=True)
+            freed = [release(rig.plant, p, port, row, link) for row, p, link in rows]
             now, grip = LoopState(x=np.stack(freed), z=now.z), None
         if phase.impulse_Ns:
-            link = _port(stage.plant).motion or ""
-            blows = [strike(stage.plant, p, x, link, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
+            link = _port(rig.plant).motion or ""
+            blows = [strike(rig.plant, p, x, link, phase.impulse_Ns) for p, x in zip(values, now.x, strict=True)]
             now = LoopState(x=np.stack(blows), z=now.z)
-        loop = stage.loop(phase.held, longest, sticks=scenario.friction == "sticking")
+        loop = rig.loop(phase.held, longest, sticks=scenario.friction == "sticking")
         reference = offset + per_force * _build_reference(
             phase, loop.law.sample_time_s, np.random.default_rng([require_seed(seed, ControlError), number])
         )
-        standing = np.zeros((1, 0)) if grip is None else _read_standing(stage, values, grip, loop.standing)
+        standing = np.zeros((1, 0)) if grip is None else _read_standing(rig, values, grip, loop.standing)
         run = run_loop(
             loop,
             values,
@@ -186,13 +186,13 @@ def play(stage: Stage, scenario: Scenario, params: Sequence[ParameterSet], *, se
         if outer is not None:
             still = dict(zip(loop.standing, standing.T, strict=False)).get(outer.position, np.zeros(1))
             positions.append(run.outputs.get(outer.position, np.broadcast_to(still[:, None], run.reference.shape)))
-    played = _join_phases(stage, runs, start, tuple(contacts))
+    played = _join_phases(rig, runs, start, tuple(contacts))
     return played if outer is None else replace(played, reference=outer.ask(played.reference, np.hstack(positions)))
 
 
-def _start_state(stage: Stage, scenario: Scenario, values: Sequence[CompletedParameters], longest: float) -> LoopState:
+def _start_state(rig: Rig, scenario: Scenario, values: Sequence[CompletedParameters], longest: float) -> LoopState:
     """Return the first states of the plant with its link free: those of the scenario, the spring relaxed."""
-    plant, loop = stage.plant, stage.loop(held=False, longest_delay_s=longest)
+    plant, loop = rig.plant, rig.loop(held=False, longest_delay_s=longest)
     start = at_rest(loop, len(values), fill_vector("state", plant.states, scenario.initial_state))
     if plant.port is not None:
         for row, p in zip(start.x, values, strict=True):
@@ -225,10 +225,10 @@ def _build_reference(phase: Phase, sample_time_s: float, rng: np.random.Generato
 
 
 def _catch(
-    stage: Stage, values: Sequence[CompletedParameters], now: LoopState
+    rig: Rig, values: Sequence[CompletedParameters], now: LoopState
 ) -> tuple[LoopState, list[dict[str, float]], Contact]:
     """Return the states after the link is caught, where its coordinate stands in each run, and the contact."""
-    plant, port = stage.plant, _port(stage.plant)
+    plant, port = rig.plant, _port(rig.plant)
     name = port.coordinate or ""
     column = list(plant.states).index(name)
     states, impulses, losses = zip(
@@ -239,10 +239,10 @@ def _catch(
 
 
 def _read_standing(
-    stage: Stage, values: Sequence[CompletedParameters], grip: Sequence[Mapping[str, float]], names: tuple[str, ...]
+    rig: Rig, values: Sequence[CompletedParameters], grip: Sequence[Mapping[str, float]], names: tuple[str, ...]
 ) -> Float[np.ndarray, "runs k"]:
     """Return where held links stand, as each of the outputs that are read of them."""
-    plant = stage.plant
+    plant = rig.plant
     observe, rows, still = output_function(plant), find_rows(plant, names), np.zeros(len(plant.inputs))
     places = [fill_vector("state", plant.states, at) for at in grip]
     return np.array(
@@ -251,9 +251,9 @@ def _read_standing(
 
 
 def _join_phases(
-    stage: Stage, runs: Sequence[LoopRun], start: Equilibrium | None, contacts: tuple[Contact, ...]
+    rig: Rig, runs: Sequence[LoopRun], start: Equilibrium | None, contacts: tuple[Contact, ...]
 ) -> Playback:
-    names = channel_names(stage.plant)
+    names = channel_names(rig.plant)
     count = runs[0].current.shape[0]
 
     def column(run: LoopRun, name: str) -> RunSamples:
@@ -268,7 +268,7 @@ def _join_phases(
         equilibrium=start,
         edges=tuple(int(edge) for edge in np.cumsum([0, *(run.time.size for run in runs)])),
         contacts=contacts,
-        faulted=find_faults(stage.law, runs[-1].end.z),
+        faulted=find_faults(rig.law, runs[-1].end.z),
         error=max(run.error for run in runs),
         command=runs[0].command,
         substeps=max(run.substeps for run in runs),

@@ -25,7 +25,7 @@ from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.uncertainty.draws import Plants
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
-from seaopt.robustness.verification.playback import Playback, Stage, play
+from seaopt.robustness.verification.playback import Playback, Rig, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
 from seaopt.units import Mechanics
 
@@ -48,7 +48,7 @@ class Verification(Result, Worded):
         Largest estimated integration error of a sample, relative to the state's largest value.
     seed : int
         Seed of noise and random excitations.
-    stages : mapping of plant name to Stage
+    rigs : mapping of plant name to Rig
     scenarios : mapping of plant name to tuple of Scenario
     draws : mapping of plant name to tuple of ParameterSet
         Nominal first; `replay` uses them.
@@ -68,7 +68,7 @@ class Verification(Result, Worded):
     real_time_factor: Mapping[str, float]
     error: OrInfinite
     seed: int
-    stages: Mapping[str, Stage]
+    rigs: Mapping[str, Rig]
     scenarios: Mapping[str, tuple[Scenario, ...]]
     draws: Mapping[str, tuple[ParameterSet, ...]]
     follows_hz: Mapping[str, tuple[float, float] | None]
@@ -86,7 +86,7 @@ class Verification(Result, Worded):
     @property
     def command(self) -> Command:
         """The controller's command: its input, unit and limit."""
-        return next(iter(self.stages.values())).controller.command
+        return next(iter(self.rigs.values())).controller.command
 
     def scenario(self, row: Outcome) -> Scenario:
         """Return the scenario of a row."""
@@ -96,22 +96,22 @@ class Verification(Result, Worded):
         """Return the samples of a row, simulated again."""
         scenario = self.scenario(row)
         drawn = self.draws[row.plant][0 if row.draw == NOMINAL else int(row.draw)]
-        return play(self.stages[row.plant], scenario, [drawn], seed=self.seed)
+        return play(self.rigs[row.plant], scenario, [drawn], seed=self.seed)
 
-    def has_loop(self, stage: Stage, name: str, nominal: ParameterSet) -> bool:
-        """Tell whether these are runs of a stage's law on its plant, at these nominal parameters."""
-        before = self.stages.get(name)
-        if before is None or before.controller is not stage.controller or before.plant is not stage.plant:
+    def has_loop(self, rig: Rig, name: str, nominal: ParameterSet) -> bool:
+        """Tell whether these are runs of a rig's law on its plant, at these nominal parameters."""
+        before = self.rigs.get(name)
+        if before is None or before.controller is not rig.controller or before.plant is not rig.plant:
             return False
         return self.draws[name][0] is nominal
 
     def recall(
-        self, stage: Stage, name: str, scenario: Scenario, draws: Sequence[ParameterSet], seed: int
+        self, rig: Rig, name: str, scenario: Scenario, draws: Sequence[ParameterSet], seed: int
     ) -> list[Outcome]:
-        """Return the rows of a scenario that was played on this stage, at these draws; none if it was not."""
-        if not self.has_loop(stage, name, draws[0]):
+        """Return the rows of a scenario that was played on this rig, at these draws; none if it was not."""
+        if not self.has_loop(rig, name, draws[0]):
             return []
-        devices, same = ((each.sensors, each.command_step) for each in (self.stages[name], stage))
+        devices, same = ((each.sensors, each.command_step) for each in (self.rigs[name], rig))
         same_draws = list(map(id, self.draws[name])) == list(map(id, draws))
         locked = any(phase.held for phase in scenario.phases)  # by a partner, which may be another one
         if locked or devices != same or self.seed != seed or not same_draws or scenario not in self.scenarios[name]:
@@ -146,18 +146,18 @@ class Verification(Result, Worded):
     def from_dict(
         cls,
         content: Mapping[str, Any],
-        stages: Mapping[str, Stage],
+        rigs: Mapping[str, Rig],
         draws: Mapping[str, tuple[ParameterSet, ...]],
         source: str,
         remedy: str,
     ) -> Verification:
-        """Return what `to_dict` gave, of the same stages and draws; nothing is simulated. Raises FileError: a key is
+        """Return what `to_dict` gave, of the same rigs and draws; nothing is simulated. Raises FileError: a key is
         missing or a value of the wrong kind.
         """
         stored = read_fields(cls, content, source, remedy=remedy)
         stored["rows"] = tuple(map(_restore_settling, stored["rows"]))
         skipped = tuple((row["scenario"], row["plant"], row["reason"]) for row in content["skipped"])
-        return cls(skipped=skipped, real_time_factor={}, stages=stages, draws=draws, **stored)
+        return cls(skipped=skipped, real_time_factor={}, rigs=rigs, draws=draws, **stored)
 
 
 def _restore_settling(row: Outcome) -> Outcome:
@@ -166,13 +166,13 @@ def _restore_settling(row: Outcome) -> Outcome:
     return replace(row, settling_s=math.inf) if never else row
 
 
-def make_stages(
+def make_rigs(
     controller: Controller, plants: Plants, sensors: Sensors | None, command_step: float, partners: Plants | None = None
-) -> dict[str, Stage]:
+) -> dict[str, Rig]:
     """Return where a controller is played: on plants as it sees them, with what holds their links."""
     seen = {name: controller.see(plant) for name, plant in plants.items()}
     return {
-        name: Stage(
+        name: Rig(
             controller=controller,
             plant=plant,
             partner=_partner(plant, (partners or {}).get(name)),
@@ -223,7 +223,7 @@ def verify(
     seed : int
         Seed of noise and random excitations.
     known : Verification, optional
-        What was played before: a scenario that it has, on the same stage at the same draws, is not played again.
+        What was played before: a scenario that it has, on the same rig at the same draws, is not played again.
     executor : concurrent.futures.Executor, optional
         Where scenarios are played (`seaopt.executors`); here, if left out. The outcomes are the same, bit for bit.
     progress : callable, optional
@@ -253,26 +253,26 @@ def verify(
     """
     check_plants(plants, draws or {}, partners or {})
     check_sensors(sensors, controller, plants)
-    stages = make_stages(controller, plants, sensors, command_step, partners)
+    rigs = make_rigs(controller, plants, sensors, command_step, partners)
     sets = {name: (parameters, *(draws or {}).get(name, ())) for name in plants}
     skipped: list[tuple[str, str, str]] = []
     parts: list[tuple[str, Scenario, list[Outcome]]] = []  # with the rows that are known
-    for name, stage in stages.items():
+    for name, rig in rigs.items():
         if scenarios is None:
             reason = "nothing saturates without a limit of the command"
-            skipped += [(scenario, name, reason) for scenario in list_left_out(controller, stage.plant)]
+            skipped += [(scenario, name, reason) for scenario in list_left_out(controller, rig.plant)]
         choose = scenarios or default_scenarios
-        for scenario in choose if isinstance(choose, Sequence) else choose(controller, stage.plant, sets[name]):
-            obstacle = scenario.obstacle(stage.plant, stage.partner)
+        for scenario in choose if isinstance(choose, Sequence) else choose(controller, rig.plant, sets[name]):
+            obstacle = scenario.obstacle(rig.plant, rig.partner)
             if obstacle is None:
-                rows = [] if known is None else known.recall(stage, name, scenario, sets[name], seed)
+                rows = [] if known is None else known.recall(rig, name, scenario, sets[name], seed)
                 parts.append((name, scenario, rows))
             else:
                 skipped.append((scenario.name, name, obstacle))
-    names = {name: {scenario.name for plant, scenario, _ in parts if plant == name} for name in stages}
-    play_part = partial(_play_part, Shared((stages, sets, names, seed)))
+    names = {name: {scenario.name for plant, scenario, _ in parts if plant == name} for name in rigs}
+    play_part = partial(_play_part, Shared((rigs, sets, names, seed)))
     results = map_ordered(play_part, [(name, scenario) for name, scenario, rows in parts if not rows], executor)
-    played: dict[str, list[_Runs]] = {name: [] for name in stages}
+    played: dict[str, list[_Runs]] = {name: [] for name in rigs}
     for number, (name, scenario, rows) in enumerate(parts):
         progress(f"{name}, scenario {number + 1} of {len(parts)}", number / len(parts))
         if rows and known is not None:
@@ -292,14 +292,14 @@ def verify(
         },
         error=max((runs.error for of_plant in played.values() for runs in of_plant), default=0.0),
         seed=seed,
-        stages=stages,
+        rigs=rigs,
         scenarios={name: tuple(runs.actual for runs in of_plant if runs.outcomes) for name, of_plant in played.items()},
         draws=sets,
         follows_hz={
             name: known.follows_hz[name]
-            if known is not None and known.has_loop(stage, name, parameters)
-            else controller.close(take_sliding(stage.plant, parameters), parameters).figures().tracking_band_hz
-            for name, stage in stages.items()
+            if known is not None and known.has_loop(rig, name, parameters)
+            else controller.close(take_sliding(rig.plant, parameters), parameters).figures().tracking_band_hz
+            for name, rig in rigs.items()
         },
     )
 
@@ -315,37 +315,37 @@ class _Runs:
     error: float = 0.0
 
 
-_Staged = tuple[dict[str, Stage], dict[str, tuple[ParameterSet, ...]], dict[str, set[str]], int]
+_Staged = tuple[dict[str, Rig], dict[str, tuple[ParameterSet, ...]], dict[str, set[str]], int]
 
 
 def _play_part(staged: Shared[_Staged], part: tuple[str, Scenario]) -> _Runs:
-    """Play a scenario on one stage; with friction that sticks, where its smoothed curve is too steep to simulate."""
-    stages, sets, names, seed = staged.value
+    """Play a scenario on one rig; with friction that sticks, where its smoothed curve is too steep to simulate."""
+    rigs, sets, names, seed = staged.value
     name, scenario = part
-    stage = stages[name]
+    rig = rigs[name]
     try:
-        return _run_scenario(stage, name, scenario, sets[name], seed)
+        return _run_scenario(rig, name, scenario, sets[name], seed)
     except StepSizeError:
         actual = make_sticking(scenario)
-        if scenario.friction == "sticking" or actual.obstacle(stage.plant, stage.partner):
+        if scenario.friction == "sticking" or actual.obstacle(rig.plant, rig.partner):
             raise
         if actual.name in names[name]:
             return _Runs(actual=actual, outcomes=[])
-        return _run_scenario(stage, name, actual, sets[name], seed)
+        return _run_scenario(rig, name, actual, sets[name], seed)
 
 
-def _run_scenario(stage: Stage, name: str, scenario: Scenario, sets: Sequence[ParameterSet], seed: int) -> _Runs:
+def _run_scenario(rig: Rig, name: str, scenario: Scenario, sets: Sequence[ParameterSet], seed: int) -> _Runs:
     """Play and judge one scenario at every set of parameters."""
-    trace = play(stage, scenario, sets, seed=seed)
-    ideal = trace if stage.is_ideal else play(stage.ideal, scenario, sets, seed=seed)
+    trace = play(rig, scenario, sets, seed=seed)
+    ideal = trace if rig.is_ideal else play(rig.ideal, scenario, sets, seed=seed)
     unlimited = None
-    if overshoots_at_limit(stage, scenario, ideal):
-        unlimited = play(stage.ideal.unlimited, scenario, sets, seed=seed)
+    if overshoots_at_limit(rig, scenario, ideal):
+        unlimited = play(rig.ideal.unlimited, scenario, sets, seed=seed)
     traces = [trace] if ideal is trace else [trace, ideal]
     return _Runs(
         actual=scenario,
-        outcomes=[judge_run(stage, name, scenario, trace, k, sets, ideal, unlimited) for k in range(len(sets))],
-        simulated_s=sum(len(sets) * played.time.size * stage.controller.sample_time_s for played in traces),
+        outcomes=[judge_run(rig, name, scenario, trace, k, sets, ideal, unlimited) for k in range(len(sets))],
+        simulated_s=sum(len(sets) * played.time.size * rig.controller.sample_time_s for played in traces),
         wall_s=sum(played.wall_s for played in traces),
         error=max(played.error for played in traces),
     )

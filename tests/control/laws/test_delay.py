@@ -31,7 +31,7 @@ from seaopt.robustness.certificate.simulated import STEPS
 from seaopt.robustness.uncertainty.delay_margin import sampled_delay_margin
 from seaopt.robustness.verification.environments import attach_environment
 from seaopt.robustness.verification.large_signal import large_signal
-from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.playback import Rig, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario
 from tests.checks import leave_out
 from tests.words import flatten
@@ -242,7 +242,7 @@ MEASURES = {
     "amplitudes": lambda law, plant, values: (
         large_signal(law, plant, values, amplitudes_N=(500.0,), frequencies_hz=(15.0,)).gain
     ),
-    "steps": lambda law, plant, values: play(Stage(controller=law, plant=plant), STEP, [values]).outputs["F1"][0],
+    "steps": lambda law, plant, values: play(Rig(controller=law, plant=plant), STEP, [values]).outputs["F1"][0],
 }
 
 

@@ -29,7 +29,7 @@ from seaopt.robustness.uncertainty.draws import combine_uncertainty
 from seaopt.robustness.uncertainty.severity import severity_slopes
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
 from seaopt.robustness.verification.linear import linearise_last_phase
-from seaopt.robustness.verification.playback import Stage
+from seaopt.robustness.verification.playback import Rig
 from seaopt.robustness.verification.scenarios import default_scenarios
 from tests.c_code import CompiledLaw
 
@@ -254,9 +254,9 @@ def test_a_cascade_is_measured_like_any_law():
 
 def test_the_noise_of_every_signal_reaches_the_force(two):
     """Of two signals with noises of their own: against the root of summed powers of the loop written out."""
-    stage = Stage(controller=two, plant=STAND, sensors=so.Sensors(noise_std={"tau_s": 0.02, "deflection": 3e-4}))
+    stage = Rig(controller=two, plant=STAND, sensors=so.Sensors(noise_std={"tau_s": 0.02, "deflection": 3e-4}))
     assert not stage.is_ideal
-    assert not Stage(controller=two, plant=STAND, sensors=so.Sensors(quantisation={"deflection": 1e-5})).is_ideal
+    assert not Rig(controller=two, plant=STAND, sensors=so.Sensors(quantisation={"deflection": 1e-5})).is_ideal
     view = linearise_last_phase(stage, default_scenarios(two, STAND)[0], VALUES)
     f = np.linspace(1e-3, 499.99, 60_000)
     t = np.abs(1.0 - view.loop.sensitivity(f))

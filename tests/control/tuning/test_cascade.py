@@ -26,7 +26,7 @@ from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from seaopt.reporting.sections.kinds.controller import list_achieved
 from seaopt.robustness.certificate.simulated import STEPS
-from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.playback import Rig, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, step_scenarios
 from tests.checks import leave_out
 
@@ -321,7 +321,7 @@ def simulate_by_hand(
 @pytest.mark.parametrize("plant", [STAND, SWING])
 def test_a_certificates_step_is_the_one_integrated_here(filtered: Controller, plant: so.Plant) -> None:
     phases = (Phase(duration_s=0.02, force_N=0.0), Phase(duration_s=0.25, force_N=8.0))
-    played = play(Stage(controller=filtered, plant=plant), Scenario(name="step", phases=phases), [VALUES])
+    played = play(Rig(controller=filtered, plant=plant), Scenario(name="step", phases=phases), [VALUES])
     found, _ = simulate_by_hand(dict(filtered.gains), played.reference[0], plant is SWING)
     assert played.reference[0, -1] == 8.0 and np.ptp(found) > 4.0
     np.testing.assert_allclose(played.outputs["tau_s"][0], found, atol=2e-4 * np.ptp(found))
@@ -331,7 +331,7 @@ def test_a_certificates_step_is_the_one_integrated_here(filtered: Controller, pl
 @pytest.mark.parametrize("number", [0, 3])
 def test_the_steps_that_a_certificate_judges_are_too(filtered: Controller, number: int) -> None:
     scenario = step_scenarios(filtered, STAND)[number]
-    played = play(Stage(controller=filtered, plant=STAND), scenario, [VALUES])
+    played = play(Rig(controller=filtered, plant=STAND), scenario, [VALUES])
     count = 1500
     found, _ = simulate_by_hand(dict(filtered.gains), played.reference[0, :count], free=False)
     assert np.ptp(played.reference[0, :count]) > 0.0

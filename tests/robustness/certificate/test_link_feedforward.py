@@ -358,8 +358,8 @@ def test_a_gripped_link_stands_where_it_was_gripped(fed: Controller) -> None:
     phases = [
         Phase(duration_s=n * TS, force_N=force, held=held) for n, held in ((300, False), (200, True), (300, False))
     ]
-    stage = verification.stages["swing"]
-    played = play(stage, Scenario(name="grip", phases=tuple(phases)), [smooth])
+    rig = verification.rigs["swing"]
+    played = play(rig, Scenario(name="grip", phases=tuple(phases)), [smooth])
     expected, command = grip_by_hand(fed, (300, 200, 300), force)
     assert np.max(np.abs(expected)) > 0.5 * force
     np.testing.assert_allclose(played.outputs["F1"][0], expected, atol=1e-4 * np.max(np.abs(expected)))

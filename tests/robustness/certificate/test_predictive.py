@@ -205,7 +205,7 @@ def test_devices_that_keep_a_run_from_settling_are_named(mpc, stand, thor):
 
 def test_what_an_amplifier_rounds_reaches_the_steps_of_the_linear_region_too(mpc, stand, thor):
     rough = so.certify(mpc, {"stand": stand}, thor, ranges=HERE, samples=1, runs=1, command_step=2.0)
-    assert all(stage.command_step == 2.0 for stage in rough.runs.stages.values())
+    assert all(rig.command_step == 2.0 for rig in rough.runs.rigs.values())
     assert 0.0 < rough.constrained.largest_ring < 0.5 * 2.0 * abs(mpc.static_gain)
 
 

@@ -17,7 +17,7 @@ from seaopt.files import to_json
 from seaopt.progress import ignore
 from seaopt.reporting.page.report import _list_plates, _sort_results
 from seaopt.robustness.certificate import scheduled
-from seaopt.robustness.certificate.cases import CertifyOptions, Survey, add_design, pose
+from seaopt.robustness.certificate.cases import CertifyOptions, CheckContext, add_design, pose
 from seaopt.robustness.certificate.friction import FRICTION, MarginDraws
 from seaopt.robustness.certificate.limits import measure_responses
 from seaopt.robustness.certificate.measured_draws import measure_draws
@@ -217,7 +217,7 @@ def test_friction_is_looked_at_on_a_plant_that_moves_the_variable_and_over_draws
     schedule, ranges = ask(tune_knee(), min_friction_margin=1e9), {"I_p": (0.33, 0.39), "f_c": (5.0, 10.0)}
     cases = pose(schedule, {"stand": read_knee()[0], "swing": swing}, values, ranges, so.ParameterSet())[0.2]
     rng = np.random.default_rng(2)
-    survey = Survey(
+    context = CheckContext(
         subject=schedule,
         shared=Shared(cases),
         source=values,
@@ -226,7 +226,7 @@ def test_friction_is_looked_at_on_a_plant_that_moves_the_variable_and_over_draws
         rng=rng,
         place=("phi", 0.2),
     )
-    found = FRICTION.measure(survey, ignore)
+    found = FRICTION.measure(context, ignore)
     (row,) = found.requirements
     margin, draws = found.fields["friction"]["swing"], found.fields["friction_draws"].get("swing")
     assert (row.name, row.plant, row.limit) == ("min_friction_margin", "swing", 1e9)
@@ -279,7 +279,7 @@ def test_a_motion_slower_than_the_rate_asked_is_not_met():
 def judge_responses(schedule, parameters, measured):
     place = next(iter(pose(schedule, {}, read_knee()[2], {}, so.ParameterSet()).values()))
     rng = np.random.default_rng(1)
-    survey = Survey(
+    context = CheckContext(
         subject=schedule,
         shared=Shared(place),
         source=parameters,
@@ -288,7 +288,7 @@ def judge_responses(schedule, parameters, measured):
         rng=rng,
         measured=measured,
     )
-    return measure_responses(replace(survey, places=[survey]), ignore).requirements
+    return measure_responses(replace(context, places=[context]), ignore).requirements
 
 
 def test_a_measured_response_is_judged_with_the_law_of_the_value_that_the_parameters_have():

@@ -16,7 +16,7 @@ from seaopt.control.loops.port import port_of
 from seaopt.control.running.equilibrium import equilibrium
 from seaopt.errors import ControlError
 from seaopt.robustness import batch_figures
-from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.playback import Rig, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.verification import verify
 from tests.blocks import of_one_input
@@ -97,7 +97,7 @@ def test_a_draw_is_played_where_it_rests_and_as_late_as_it_is(request, swing, th
     sums = [tf.num.sum() for tf in (one.reference, one.measurement)]
     start = force if law == "controller" else (current / one.command.per_effort * one.measurement.den.sum()
                                                + sums[1] * force) / sums[0]  # fmt: skip
-    trace = play(Stage(controller=one, plant=swing), STEP, [thor, at(drawn, phi=phi, delay_s=delay_s)])
+    trace = play(Rig(controller=one, plant=swing), STEP, [thor, at(drawn, phi=phi, delay_s=delay_s)])
     references = start + np.where(np.arange(400) < 120, 30.0, 0.0)
     np.testing.assert_allclose(trace.reference[1], references, atol=1e-6)
     whole = int(delay_s / TS)
@@ -120,7 +120,7 @@ def test_conditions_have_units(controller, stand, swing, thor):
     assert figures[0].ms == pytest.approx(figures[1].ms, rel=1e-9)
     assert batch_figures(controller, swing, given, {"I_p": np.array([0.36])}).ms[0] == pytest.approx(figures[1].ms)
     assert [port_of(stand, params, "F1", 1.0).delay_s for params in (given, small)] == pytest.approx([4e-4, 4e-4])
-    traces = [play(Stage(controller=controller, plant=swing), STEP, [params]) for params in (given, small)]
+    traces = [play(Rig(controller=controller, plant=swing), STEP, [params]) for params in (given, small)]
     np.testing.assert_allclose(traces[0].outputs["F1"], traces[1].outputs["F1"], rtol=1e-9)
     for value, unit, words in ((-1e-4, "s", "negative"), (1.0, "m", "dimension")):
         wrong = thor.with_parameters(so.Parameter(name="delay_s", value=value, unit=unit))
@@ -131,11 +131,11 @@ def test_conditions_have_units(controller, stand, swing, thor):
 def test_nothing_moves_until_something_happens(controller, proportional, swing, thor):
     still = Scenario(name="still", phases=(Phase(duration_s=2.0),))
     for phi in np.linspace(-1.2, 1.2, 13):  # speeds are rounding then, which no number of steps makes smaller
-        trace = play(Stage(controller=controller, plant=swing), still, [at(thor, phi=phi, delay_s=0.2e-3)])
+        trace = play(Rig(controller=controller, plant=swing), still, [at(thor, phi=phi, delay_s=0.2e-3)])
         assert np.ptp(trace.outputs["phi"][0]) < 1e-9
         assert trace.substeps == 2
     for law in (controller, proportional):
-        trace = play(Stage(controller=law, plant=swing), still, [at(thor, phi=0.9, delay_s=0.2e-3), thor])
+        trace = play(Rig(controller=law, plant=swing), still, [at(thor, phi=0.9, delay_s=0.2e-3), thor])
         assert np.ptp(trace.outputs["phi"][0]) < 1e-9
         assert np.ptp(trace.current[0]) < 1e-7
         assert trace.equilibrium.force == pytest.approx([resting_by_hand(thor, 0.9)[1], 0.0], rel=1e-9)
@@ -146,7 +146,7 @@ def test_small_steps_there_are_the_linear_loops(controller, swing, thor):
     """Of the plant that the linear figures speak of: x+ = a x + b u with the drawn angle and delay."""
     drawn = at(thor.update(I_p=0.2), phi=0.8, delay_s=0.4e-3)
     phases = (Phase(duration_s=0.3, force_N=0.05),)
-    trace = play(Stage(controller=controller, plant=swing), Scenario(name="s", phases=phases), [drawn])
+    trace = play(Rig(controller=controller, plant=swing), Scenario(name="s", phases=phases), [drawn])
     plant = controller.close(swing, drawn).plant
     a, b, (c,), (d,) = of_one_input(plant.block)
     law, x, forces = Difference(controller, 0.0, 0.0, 0.0), np.zeros(b.size), []
@@ -162,7 +162,7 @@ def test_the_fall_is_dop853s_and_its_energy_is_the_work_done(controller, swing, 
     drawn = thor.update(f_c=20.0, d=0.05)
     (fall,) = [item for item in default_scenarios(controller, swing) if item.name == "fall through 90 deg"]
     short = replace(fall, phases=(Phase(duration_s=1.5),))
-    trace = play(Stage(controller=controller, plant=swing), short, [at(drawn, phi=0.5, delay_s=0.3e-3)])
+    trace = play(Rig(controller=controller, plant=swing), short, [at(drawn, phi=0.5, delay_s=0.3e-3)])
     rate, _ = swing_by_hand(drawn)
     p = {name: item.value for name, item in drawn.items()}
     radius = p["l"] / (2 * np.pi * p["N_p"])
@@ -212,8 +212,8 @@ def test_every_scenario_of_a_draw_that_rests_at_an_angle(controller, stand, swin
 
 def test_a_link_is_held_and_let_go_at_the_drawn_angle(controller, stand, swing, thor):
     phases = (Phase(duration_s=0.2, held=True), Phase(duration_s=0.5))
-    stage = Stage(controller=controller, plant=swing, partner=stand)
-    trace = play(stage, Scenario(name="hold", phases=phases), [at(thor, phi=0.6)])
+    rig = Rig(controller=controller, plant=swing, partner=stand)
+    trace = play(rig, Scenario(name="hold", phases=phases), [at(thor, phi=0.6)])
     assert np.all(np.isnan(trace.outputs["phi"][0, :200]))
     np.testing.assert_allclose(trace.outputs["phi"][0, 200:], 0.6, atol=1e-9)
     np.testing.assert_allclose(trace.outputs["F1"][0], resting_by_hand(thor, 0.6)[1], rtol=1e-9)
@@ -255,7 +255,7 @@ def test_the_certificates_worst_draw_is_played_there(controller, swing, thor):
 
 def test_a_law_whose_reference_does_nothing_is_refused(controller, swing, thor):
     deaf = replace(controller, law=scaled(controller.law, 0.0, 1.0))
-    loop = Stage(controller=deaf, plant=swing).loop(held=False)
+    loop = Rig(controller=deaf, plant=swing).loop(held=False)
     assert runnable(deaf).integrators
     with pytest.raises(ControlError, match="blocked at 0 Hz"):
         equilibrium(loop, [swing.complete(at(thor, phi=0.3))])

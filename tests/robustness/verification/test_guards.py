@@ -10,7 +10,7 @@ import pytest
 import seaopt as so
 from seaopt.control import PlausibilityGate
 from seaopt.robustness.verification.large_signal import large_signal
-from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.playback import Rig, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario
 from seaopt.robustness.verification.verification import verify
 from tests.control.deploy.test_derating import HEAT, LIMIT_A, warm
@@ -57,7 +57,7 @@ def test_the_heat_guard_limits_the_current_of_a_run():
     controller = so.tune(plant, values, spec)
     push = Scenario(name="push", phases=(Phase(duration_s=3.0, force_N=2.0 * controller.force_limit(0.0)),))
     hottest = {
-        derate: np.max(warm(play(Stage(controller=each, plant=plant), push, [values]).current[0]))
+        derate: np.max(warm(play(Rig(controller=each, plant=plant), push, [values]).current[0]))
         for derate in (False, True)
         for each in [replace(controller, derate=derate)]
     }

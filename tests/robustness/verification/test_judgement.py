@@ -13,7 +13,7 @@ from seaopt.control import Gains, Loop
 from seaopt.control.laws.realisation import runnable
 from seaopt.errors import SimulationError
 from seaopt.robustness.verification.linear import linearise_last_phase
-from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.playback import Rig, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.verification import verify
 from tests.blocks import of_one_input
@@ -32,8 +32,8 @@ def chosen(controller, plant, name):
 
 def test_an_amplifier_that_rounds_stays_within_the_limit(controller, stand, thor):
     """The law's own commands, rounded by NumPy to whole steps and cut at 8.96 A = 128 steps of 0.07 A."""
-    stage = Stage(controller=controller, plant=stand, command_step=0.07)
-    trace = play(stage, chosen(controller, stand, "saturating doublet"), [thor])
+    rig = Rig(controller=controller, plant=stand, command_step=0.07)
+    trace = play(rig, chosen(controller, stand, "saturating doublet"), [thor])
     commands, _ = runnable(controller).run(trace.reference[0], trace.outputs["F1"][0])
     rounded = np.clip(0.07 * np.round(commands / 0.07), -8.96, 8.96)
     np.testing.assert_allclose(trace.current[0, 1:], rounded[:-1], atol=1e-9)
@@ -52,8 +52,8 @@ def test_a_step_above_the_limit_leaves_no_current(controller, stand, thor):
 def test_a_load_is_no_bound_on_what_is_known(controller, stand, swing, thor):
     """The same run, sample by sample, whether the inertia's bounds hold 1.5 times its value or not."""
     bounded = thor.with_parameters(replace(thor["I_p"], min=0.3, max=0.5))
-    stage = Stage(controller=controller, plant=swing, partner=stand)
-    loaded = [play(stage, chosen(controller, swing, "payload"), [params]) for params in (thor, bounded)]
+    rig = Rig(controller=controller, plant=swing, partner=stand)
+    loaded = [play(rig, chosen(controller, swing, "payload"), [params]) for params in (thor, bounded)]
     np.testing.assert_array_equal(loaded[0].outputs["phi"], loaded[1].outputs["phi"])
     assert verify(controller, {"swing": swing}, bounded, scenarios=[chosen(controller, swing, "payload")]).passed
 
@@ -140,11 +140,11 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
     """P = A P A' + B B' of noise and rounding, solved by SciPy, against the integral over frequency."""
     from scipy.linalg import solve_discrete_lyapunov
 
-    stage = Stage(
+    rig = Rig(
         controller=controller, plant=stand, sensors=so.Sensors(noise_std={"F1": 2.0}, quantisation={"F1": 3.0}),
         command_step=0.1,
     )  # fmt: skip
-    view = linearise_last_phase(stage, default_scenarios(controller, stand)[0], thor)
+    view = linearise_last_phase(rig, default_scenarios(controller, stand)[0], thor)
     system = controller.close(stand, thor).system()
     read = np.outer(system.b[:, 0], system.b[:, 0]) * (4.0 + 9.0 / 12.0)
     c, d = system.c[0], (system.d[0, 0] - 1.0) ** 2 * (4.0 + 9.0 / 12.0)
@@ -169,7 +169,7 @@ def test_a_slow_stick_slip_cycle_is_found_with_its_fundamental(controller, stand
     params = plant.complete(thor).update(f_c=100.0, v_s=1e-5, f_s=300.0, v_st=3e-4)
     assert Loop(plant=hunter.plant(plant, params), law=hunter.law).figures().stable
     hold = Scenario(name="hold", phases=(Phase(duration_s=0.2), Phase(duration_s=9.5, force_N=50.0)))
-    force = play(Stage(controller=hunter, plant=plant), hold, [params]).outputs["F1"][0, -8192:]
+    force = play(Rig(controller=hunter, plant=plant), hold, [params]).outputs["F1"][0, -8192:]
     spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(8192))) / 2048.0
     top = int(np.argmax(spectrum))
     assert spectrum[top] > 30.0 and 2.0 < top / 8.192 < 4.0

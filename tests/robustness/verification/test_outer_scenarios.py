@@ -11,7 +11,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import Impedance, add_impedance, tune_schedule
 from seaopt.robustness.verification.linear import linearise_last_phase
-from seaopt.robustness.verification.playback import Stage, play
+from seaopt.robustness.verification.playback import Rig, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios
 from seaopt.robustness.verification.schedule_sweep import RestStart
 from seaopt.robustness.verification.verification import verify
@@ -84,7 +84,7 @@ def close_by_hand(controller, stiffness=40.0):
 
 
 def test_a_step_moves_the_link_as_the_equations_say(knee):
-    played = play(Stage(controller=knee, plant=FREE), STEP, [VALUES])
+    played = play(Rig(controller=knee, plant=FREE), STEP, [VALUES])
     torque, asked, place = simulate(knee, np.repeat([0.0, 0.1], [200, 1000]))  # 4 N m over 40 N m/rad
     assert place[-1] > 0.08 and np.max(torque) > 1.0
     for found, expected in ((played.outputs["tau_s"], torque), (played.reference, asked)):
@@ -93,24 +93,22 @@ def test_a_step_moves_the_link_as_the_equations_say(knee):
 
 
 def test_damping_alone_is_added_to_the_torque_that_is_asked_for(damped, force):
-    played = play(Stage(controller=damped, plant=FREE), STEP, [VALUES])
+    played = play(Rig(controller=damped, plant=FREE), STEP, [VALUES])
     push = np.repeat([0.0, 4.0], [200, 1000])
     torque, asked, place = simulate(damped, np.zeros(1200), push)
     assert np.min(asked[220:]) < 0.6 * 4.0  # it is damped
     for found, expected in ((played.outputs["tau_s"], torque), (played.reference, asked)):
         np.testing.assert_allclose(found[0], expected, atol=1e-5 * np.ptp(expected))
     np.testing.assert_allclose(played.outputs["theta_l"][0], place, atol=1e-6)
-    held, plain = (play(Stage(controller=each, plant=HELD), STEP, [VALUES]) for each in (damped, force))
+    held, plain = (play(Rig(controller=each, plant=HELD), STEP, [VALUES]) for each in (damped, force))
     np.testing.assert_allclose(held.outputs["tau_s"], plain.outputs["tau_s"], atol=1e-9)
 
 
 def test_a_link_that_is_held_or_gripped_has_the_force_asked_for(knee, force):
-    held, plain = (play(Stage(controller=each, plant=HELD), STEP, [VALUES]) for each in (knee, force))
+    held, plain = (play(Rig(controller=each, plant=HELD), STEP, [VALUES]) for each in (knee, force))
     np.testing.assert_allclose(held.outputs["tau_s"], plain.outputs["tau_s"], atol=1e-9)
     push, grip = Phase(duration_s=0.3, force_N=4.0), Phase(duration_s=0.3, force_N=4.0, held=True)
-    played = play(
-        Stage(controller=knee, plant=FREE, partner=HELD), Scenario(name="grip", phases=(push, grip)), [VALUES]
-    )
+    played = play(Rig(controller=knee, plant=FREE, partner=HELD), Scenario(name="grip", phases=(push, grip)), [VALUES])
     place = played.outputs["theta_l"][0, 299]
     assert place > 0.02
     assert played.reference[0, -1] == pytest.approx(40.0 * (0.1 - place), abs=0.05)  # a sample later
@@ -121,7 +119,7 @@ def test_a_pendulum_rests_at_an_angle_where_its_stiffness_carries_it(force):
     placed = so.Parameter(name="theta_l", value=0.4, unit="rad")
     values = PENDULUM.defaults.with_parameters(*VALUES.values()).update(m=1.0, L=0.3).with_parameters(placed)
     stiff = add_impedance(force, PENDULUM, values, ASKED, name="leg")
-    played = play(Stage(controller=stiff, plant=PENDULUM), STEP, [values])
+    played = play(Rig(controller=stiff, plant=PENDULUM), STEP, [values])
     weight = 1.0 * 9.81 * 0.3 * np.sin(0.4)
     np.testing.assert_allclose(played.outputs["theta_l"][0, :200], 0.4, atol=1e-9)
     np.testing.assert_allclose(played.reference[0, :200], weight, atol=1e-6)
@@ -131,7 +129,7 @@ def test_a_pendulum_rests_at_an_angle_where_its_stiffness_carries_it(force):
 @pytest.mark.parametrize("stiffness", [40.0, 0.0])
 def test_the_linear_loop_of_the_judgement_has_the_outer_loop(knee, damped, stiffness):
     law = knee if stiffness else damped
-    view = linearise_last_phase(Stage(controller=law, plant=FREE), STEP, VALUES)
+    view = linearise_last_phase(Rig(controller=law, plant=FREE), STEP, VALUES)
     found, expected = view.loop.eigenvalues(), np.linalg.eigvals(close_by_hand(law, stiffness))
     np.testing.assert_allclose(*(np.sort(np.abs(each))[::-1][:6] for each in (found, expected)), rtol=1e-7)
 
@@ -149,7 +147,7 @@ def test_an_outer_loop_that_makes_the_link_swing_fails_its_scenarios(force, knee
 
 def test_noise_of_the_position_is_in_the_runs(knee):
     seen = [
-        play(Stage(controller=knee, plant=FREE, sensors=so.Sensors(noise_std=std)), STEP, [VALUES])
+        play(Rig(controller=knee, plant=FREE, sensors=so.Sensors(noise_std=std)), STEP, [VALUES])
         for std in ({}, {"theta_l": 1e-4})
     ]
     assert np.std(seen[1].outputs["tau_s"] - seen[0].outputs["tau_s"]) > 0.001

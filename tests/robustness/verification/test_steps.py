@@ -175,8 +175,8 @@ def test_steps_are_played_once(limited_controller, stand, thor, monkeypatch):
     certificate = so.certify(limited_controller, {"stand": stand}, thor, simulations=False)
     played = []
     monkeypatch.setattr(
-        verification, "play", lambda stage, scenario, *rest, **more: played.append(scenario.name) or play(
-            stage, scenario, *rest, **more
+        verification, "play", lambda rig, scenario, *rest, **more: played.append(scenario.name) or play(
+            rig, scenario, *rest, **more
         )
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ from seaopt.errors import ControlError
 from seaopt.reporting.sections.kinds.verification import describe_tracking
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.oscillation import find_oscillation
-from seaopt.robustness.verification.playback import Stage, _build_reference, play
+from seaopt.robustness.verification.playback import Rig, _build_reference, play
 from seaopt.robustness.verification.scenarios import Phase, Scenario, default_scenarios, find_step_limit, list_left_out
 from seaopt.robustness.verification.verification import verify
 from tests.blocks import of_one_input
@@ -163,7 +163,7 @@ def test_limits_are_named_with_the_draw(controller, swing, thor):
 
 def test_a_payload_arrives(controller, swing, thor):
     phases = (Phase(duration_s=0.2, force_N=30.0), Phase(duration_s=0.5, scale={"m": 2.0, "I_p": 2.0}))
-    trace = play(Stage(controller=controller, plant=swing), Scenario(name="p", phases=phases), [thor])
+    trace = play(Rig(controller=controller, plant=swing), Scenario(name="p", phases=phases), [thor])
     k = trace.edges[1]
     phi = trace.outputs["phi"][0]
     speed = (phi[k] - phi[k - 1]) / 1e-3
@@ -182,7 +182,7 @@ def test_what_cannot_be_played_is_said(controller, stand, swing, thor):
     assert verify(controller, {"swing": swing}, thor, scenarios=[contact], partners={"swing": stand}).rows
     blow = Scenario(name="blow", phases=(Phase(duration_s=0.1, impulse_Ns=1.0),))
     with pytest.raises(ControlError, match="cannot be played"):
-        play(Stage(controller=controller, plant=stand), blow, [thor])
+        play(Rig(controller=controller, plant=stand), blow, [thor])
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,7 @@ def test_far_above_the_limit_the_current_is_a_square_wave(controller, stand, tho
 def test_a_chirp_needs_its_phase(controller, stand, thor):
     """The reference of a phase is its constant and its excitation, sample by sample."""
     phase = Phase(duration_s=0.5, force_N=7.0, excitation=(Chirp(amplitude=3.0, f0_hz=5.0, f1_hz=20.0),))
-    trace = play(Stage(controller=controller, plant=stand), Scenario(name="c", phases=(phase,)), [thor])
+    trace = play(Rig(controller=controller, plant=stand), Scenario(name="c", phases=(phase,)), [thor])
     rise = np.log(4.0) / 0.5
     expected = 7 + 3 * np.sin(2 * np.pi * 5.0 / rise * np.expm1(rise * trace.time))
     np.testing.assert_allclose(trace.reference[0], expected, atol=1e-9)

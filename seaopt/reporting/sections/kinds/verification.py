@@ -127,7 +127,7 @@ def describe_drawings(verification: Verification, plant: str) -> str:
 def describe_tracking(verification: Verification) -> Iterator[str]:
     """Yield a line per plant whose moving output keeps the force from following slow references."""
     for name, band in verification.follows_hz.items():
-        if not verification.stages[name].plant.moves:
+        if not verification.rigs[name].plant.moves:
             continue
         if band is None:
             yield f"{name} tracks no reference within 3 dB: the swinging output prevents it"
@@ -140,7 +140,7 @@ def describe_tracking(verification: Verification) -> Iterator[str]:
 
 def describe_steps(verification: Verification) -> Iterator[str]:
     """Yield a line per plant on which steps are judged: the worst that its user sees of them."""
-    for plant in verification.stages:
+    for plant in verification.rigs:
         rows = [row for row in verification.rows if row.plant == plant and row.settling_s is not None]
         if not rows:
             continue
