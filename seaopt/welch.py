@@ -1,7 +1,7 @@
-"""Welch's averages: segments under Hann's window that overlap by half, without their means (Welch 1967).
+"""Welch's averages: windows under Hann's taper that overlap by half, without their means (Welch 1967).
 
-The window is the periodic one, whose transform is nothing but three lines, (-1/4, 1/2, -1/4): what reads spectra here
-counts on it (Parseval's 3/8, the mean of three lines that an H1 estimate is). Two channels' segments are cut alike.
+The taper is the periodic one, whose transform is nothing but three lines, (-1/4, 1/2, -1/4): what reads spectra here
+counts on it (Parseval's 3/8, the mean of three lines that an H1 estimate is). Two channels' windows are cut alike.
 """
 
 from __future__ import annotations
@@ -12,40 +12,40 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Complex, Float
 
-INDEPENDENT = 0.947  # averages that a segment counts as, half of which is the next one's (Welch 1967, Hann)
-MEAN_SQUARE = 0.375  # of the window
+INDEPENDENT = 0.947  # averages that a window counts as, half of which is the next one's (Welch 1967, Hann)
+MEAN_SQUARE = 0.375  # of the taper
 Start = TypeVar("Start")
 
 
 def hann(length: int) -> Float[np.ndarray, " n"]:
-    """Return Hann's window of a period."""
+    """Return Hann's taper of a period."""
     return np.hanning(length + 1)[:length]
 
 
 def list_starts(runs: Iterable[slice], length: int) -> list[int]:
-    """Return the first rows of the segments that lie in runs of rows, each half a segment after the last."""
+    """Return the first rows of the windows that lie in runs of rows, each half a window after the last."""
     return [row for run in runs for row in range(run.start, run.stop - length + 1, max(length // 2, 1))]
 
 
 def thin(starts: Sequence[Start], most: int) -> list[Start]:
-    """Return at most so many of the segments, evenly spread over all of them."""
+    """Return at most so many of the windows, evenly spread over all of them."""
     if len(starts) <= most:
         return list(starts)
     return [starts[i] for i in np.linspace(0, len(starts) - 1, most).astype(int)]
 
 
-def count_averages(segments: int) -> float:
-    """Return how many independent averages so many segments are worth."""
-    return max(1.0, INDEPENDENT * segments)
+def count_averages(windows: int) -> float:
+    """Return how many independent averages so many windows are worth."""
+    return max(1.0, INDEPENDENT * windows)
 
 
 def transform(
-    segments: Float[np.ndarray, "*shape n"], window: Float[np.ndarray, " n"]
+    windows: Float[np.ndarray, "*shape n"], taper: Float[np.ndarray, " n"]
 ) -> Complex[np.ndarray, "*shape m"]:
-    """Return the spectra of windowed segments without their means; the segments are used up."""
-    segments -= segments.mean(axis=-1, keepdims=True)
-    segments *= window  # in place: fresh memory costs more than the transform
-    return np.fft.rfft(segments)
+    """Return the spectra of windows without their means, tapered; the windows are used up."""
+    windows -= windows.mean(axis=-1, keepdims=True)
+    windows *= taper  # in place: fresh memory costs more than the transform
+    return np.fft.rfft(windows)
 
 
 def square(values: Complex[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:

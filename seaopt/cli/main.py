@@ -158,7 +158,7 @@ def frf(
     verbose: Verbose = False,
     stretch: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", min=0.0, help="Length of each averaged stretch, 1/(resolution in Hz)."),
+        typer.Option(metavar="SECONDS", min=0.0, help="Length of each averaged window, 1/(resolution in Hz)."),
     ] = None,
 ) -> None:
     """Estimate frequency responses (H1, coherence, second-order fit); write frf.json and its figure."""

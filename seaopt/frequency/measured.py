@@ -1,12 +1,12 @@
 r"""A measured frequency response with its uncertainty: at every line a disc that holds the truth, at a confidence.
 
-With :math:`n_d` averages of segments the error of the H1 estimate of a log with a known input is a complex normal one,
+With :math:`n_d` averages of windows the error of the H1 estimate of a log with a known input is a complex normal one,
 and at one line (Goodman 1965; Bendat and Piersol, Random Data, 4th ed., ch. 9)
 
 .. math:: P\Big(|H - H_1|^2 > |H_1|^2\,\frac{1-\gamma^2}{\gamma^2}\,\big(\alpha^{-1/(n_d-1)} - 1\big)\Big) = \alpha .
 
 All discs together hold the truth with the confidence stated: :math:`\alpha = (1 - \text{confidence})/m` at each of m
-lines (Bonferroni), those of all lengths of segments that are compared. The radius includes what the estimate
+lines (Bonferroni), those of all lengths of windows that are compared. The radius includes what the estimate
 cannot see: Hann's window takes the mean of three lines, which is off by :math:`|\Delta^2 H|/6`, and a straight line
 from one frequency to the next by :math:`|\Delta^2 H|/8`, with :math:`\Delta^2` the second difference over neighbouring
 lines. A resonance narrower than a line is not seen.
@@ -39,8 +39,8 @@ HIGHEST = 0.9  # of the log's Nyquist frequency: above, what is sampled is folde
 SMOOTH = 5  # lines of which the median radius decides where the band ends
 LEAST_LINES = 8
 UNSEEN = 1.0 / 6.0 + 1.0 / 8.0  # of the second difference: window and interpolation
-LONGEST, SHORTEST = 16, 64  # segments in a log; samples in a segment
-PARTS, OCTAVES = 3, 20  # segments are chosen anew in every third of an octave
+LONGEST, SHORTEST = 16, 64  # windows in a log; samples in a window
+PARTS, OCTAVES = 3, 20  # windows are chosen anew in every third of an octave
 
 
 @record(eq=False)
@@ -158,7 +158,7 @@ def measure_response(
     confidence : float
         Of all discs together.
     stretch_s : float, optional
-        Length of a segment; if left out, in every third of an octave the one of n/16, n/32, ... samples whose discs
+        Length of a window; if left out, in every third of an octave the one of n/16, n/32, ... samples whose discs
         are smallest.
 
     Raises
@@ -181,7 +181,7 @@ def measure_response(
             f"take a log in which {source} alone is excited"
         )
     chosen = Clock(period=log.period) if clock is None else clock
-    lengths = [stretch_s] if stretch_s is not None else _list_segments(len(log), log.period)
+    lengths = [stretch_s] if stretch_s is not None else _list_windows(len(log), log.period)
     estimates = [h1(log[source], log[output], log.period, stretch_s=length) for length in lengths]
     f, response, radius, averages = _choose_discs(estimates, confidence, HIGHEST * 0.5 / log.period)
     if f.size < LEAST_LINES:
@@ -206,8 +206,8 @@ def measure_response(
 Discs = tuple[Lines, ComplexLines, Lines, Int[np.ndarray, " m"]]
 
 
-def _list_segments(samples: int, period: float) -> list[float]:
-    """Return lengths of segments to try, in seconds, each half of the one before."""
+def _list_windows(samples: int, period: float) -> list[float]:
+    """Return lengths of windows to try, in seconds, each half of the one before."""
     lengths = [samples // LONGEST]
     while lengths[-1] // 2 >= SHORTEST:
         lengths.append(lengths[-1] // 2)

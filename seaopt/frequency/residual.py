@@ -29,7 +29,7 @@ from seaopt.records import record
 
 LAGS = 64  # samples that predict errors and input
 AHEAD, FAR = 16, 256  # samples within which a law answers, and up to which the input is looked at
-BLOCK, MOST_BLOCKS = 2000, 20  # samples that a law's answer is sought in, and how many times
+WINDOW, MOST_WINDOWS = 2000, 20  # samples that a law's answer is sought in, and how many times
 FALSE_ALARM = 1e-4
 UNFELT = 1e-4  # of the input's std: less of it is not taken for an answer
 LENGTHS = 4  # of windows, each half of the one before
@@ -93,8 +93,8 @@ def _average(u: Any, model: Any, error: Any, period: float, starts: Any, length:
 
     f = np.fft.rfftfreq(length, period)
     last = int(np.searchsorted(f, highest)) + 1
-    window, rows = welch.hann(length), np.asarray(starts)[:, None] + np.arange(length)
-    uf, *spectra = (welch.transform(x[rows], window)[:, 1 : last + 1] for x in (u, *model, *error))
+    taper, rows = welch.hann(length), np.asarray(starts)[:, None] + np.arange(length)
+    uf, *spectra = (welch.transform(x[rows], taper)[:, 1 : last + 1] for x in (u, *model, *error))
     power = np.maximum(np.sum(welch.square(uf), axis=0), 1e-300)
     outputs, y, freedom = np.array(spectra), len(model), welch.count_averages(len(starts)) - 1.0
     response = np.sum(np.conj(uf) * outputs, axis=1) / power
@@ -136,13 +136,13 @@ def find_feedback(
     """
     from scipy.special import chdtri  # deferred: 0.1 s
 
-    stretches = [(a, min(a + BLOCK, run.stop)) for run in runs for a in range(run.start, run.stop, BLOCK)]
-    stretches = [(a, b) for a, b in stretches if b - a >= BLOCK // 2][:MOST_BLOCKS]
-    if not stretches:
+    windows = [(a, min(a + WINDOW, run.stop)) for run in runs for a in range(run.start, run.stop, WINDOW)]
+    windows = [(a, b) for a, b in windows if b - a >= WINDOW // 2][:MOST_WINDOWS]
+    if not windows:
         return False
     floor, outputs = UNFELT * float(np.nanstd(u)), len(error)
     sums, powers = np.zeros((outputs, FAR)), np.zeros((outputs, FAR))
-    for a, b in stretches:  # a prediction of each follows a chirp
+    for a, b in windows:  # a prediction of each follows a chirp
         view = np.lib.stride_tricks.sliding_window_view(np.vstack([u[a:b], error[:, a:b]]), LAGS + 1, axis=1)
         later = _leave(view[0, :, :-1], view[0, :, -1])
         noises = _leave(np.hstack([view[0], *view[1:, :, :-1]]), view[1:, :, -1].T).T

@@ -1,13 +1,13 @@
 r"""Frequency response of a log: the H1 estimate and its coherence.
 
-Welch's averages of Hann-windowed segments that overlap by half (Bendat and Piersol, Random Data, 4th ed., ch. 6):
+Welch's averages of Hann-tapered windows that overlap by half (Bendat and Piersol, Random Data, 4th ed., ch. 6):
 
 .. math:: H_1 = S_{uy} / S_{uu}, \qquad \gamma^2 = |S_{uy}|^2 / (S_{uu} S_{yy}),
           \qquad \sigma_{|H_1|} / |H_1| = \sqrt{(1 - \gamma^2) / (2 \gamma^2 n_d)} .
 
 The window spreads a line over its neighbours, in amplitude by (-1/4, 1/2, -1/4): for an input that is white nearby, H1
 estimates the mean of the response over three lines, weighted by the squares (1/6, 2/3, 1/6). That bias is small where
-the segment is long against the plant's memory; models compared with H1 are spread likewise
+the window is long against the plant's memory; models compared with H1 are spread likewise
 (`FrequencyResponse.expected`).
 """
 
@@ -58,7 +58,7 @@ class FrequencyResponse:
     def expected(self, response: Callable[[Any], Any]) -> Complex[np.ndarray, "m ..."]:
         """Return what H1 is on average where the plant's response is `response`, a function of frequencies in Hz.
 
-        The first line, beside the mean that every segment is rid of, is not corrected.
+        The first line, beside the mean that every window is rid of, is not corrected.
         """
         f = self.frequency_hz
         line = f[1] - f[0]
@@ -86,12 +86,12 @@ def h1(
     period : float
         Seconds between samples.
     stretch_s : float, optional
-        Length of a segment, which sets the resolution 1/stretch_s; a sixteenth of the record if left out.
+        Length of a window, which sets the resolution 1/stretch_s; a sixteenth of the record if left out.
 
     Raises
     ------
     LogError
-        The record is shorter than two segments or 32 samples, or the input is constant.
+        The record is shorter than two windows or 32 samples, or the input is constant.
 
     Examples
     --------
@@ -118,17 +118,17 @@ def responses(
     length = int(n / 16) if stretch_s is None else round(stretch_s / period)
     length = max(length, 16)
     if n < 2 * length:
-        raise LogError(f"{n} samples are too few for segments of {length * period:g} s; use a longer log")
+        raise LogError(f"{n} samples are too few for windows of {length * period:g} s; use a longer log")
     if np.ptp(u) == 0.0:
         raise LogError("the input is constant; a frequency response needs excitation")
     starts = welch.list_starts([slice(0, n)], length)
-    window = welch.hann(length)
+    taper = welch.hann(length)
     suu, syy = np.zeros(length // 2), np.zeros((len(outputs), length // 2))
     suy = np.zeros(syy.shape, dtype=complex)
     # Long logs are looked at in the memory of a batch.
     for batch in np.array_split(starts, -(-len(starts) * length // BATCH)):
         uf, *spectra = (
-            welch.transform(np.stack([x[start : start + length] for start in batch]), window)[:, 1:]
+            welch.transform(np.stack([x[start : start + length] for start in batch]), taper)[:, 1:]
             for x in (u, *outputs)
         )
         suu += _power(uf) / len(starts)
@@ -161,16 +161,16 @@ def conditioned_responses(
     alone explains of what the others leave (Bendat and Piersol, ch. 7). Inputs that follow each other have little.
     """
     length = max(round(stretch_s / period), 16)
-    window, starts = welch.hann(length), welch.list_starts([slice(0, inputs[0].size)], length)
+    taper, starts = welch.hann(length), welch.list_starts([slice(0, inputs[0].size)], length)
     if len(starts) <= len(inputs):
-        raise LogError(f"{inputs[0].size} samples are too few for segments of {length * period:g} s; use a longer log")
+        raise LogError(f"{inputs[0].size} samples are too few for windows of {length * period:g} s; use a longer log")
 
     def average(left: Any, right: Any) -> Any:
         """Return the averaged cross spectra of each of one side with each of the other, lines first."""
         return np.einsum("asm,bsm->mab", np.conj(left), right) / len(starts)
 
     u, y = (
-        np.stack([welch.transform(np.stack([x[s : s + length] for s in starts]), window)[:, 1:] for x in channels])
+        np.stack([welch.transform(np.stack([x[s : s + length] for s in starts]), taper)[:, 1:] for x in channels])
         for channels in (inputs, outputs)
     )
     inverse = np.linalg.pinv(average(u, u), hermitian=True)

@@ -266,7 +266,7 @@ def second_order(
 
 
 def coherent_lines(estimate: FrequencyResponse) -> Bool[np.ndarray, " m"]:
-    """Return which lines have a coherence above 0.8; never the first, beside the mean that segments are rid of."""
+    """Return which lines have a coherence above 0.8; never the first, beside the mean that windows are rid of."""
     lines = estimate.coherence > MIN_COHERENCE
     lines[0] = False
     return lines

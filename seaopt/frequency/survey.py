@@ -195,7 +195,7 @@ def survey(
     gain : mapping of output to float, optional
         Of the sensors; 1 where left out.
     stretch_s : float, optional
-        Length of a segment, as of `h1`.
+        Length of a window, as of `h1`.
 
     Raises
     ------

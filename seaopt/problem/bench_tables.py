@@ -285,8 +285,8 @@ class ExperimentTable(StrictTable):
         '"first" for a measured input: straight lines between its samples.', default="zero"
     )
     drift: Whole = key("Order of a polynomial that each output may drift by.", default=0, ge=0, le=5)
-    shots: Whole = key("Pieces with initial states of their own.", default=1, ge=1, le=100_000)
-    slice_s: tuple[Number, Number] | None = key("Stretch that is used, in seconds from the log's start.", default=None)
+    shots: Whole = key("Parts with initial states of their own.", default=1, ge=1, le=100_000)
+    slice_s: tuple[Number, Number] | None = key("Part that is used, in seconds from the log's start.", default=None)
     resample: Literal["restamp"] | ResampleTable | None = key(
         '"restamp" for rounded timestamps; a rate for uneven ones.', default=None
     )

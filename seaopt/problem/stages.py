@@ -111,7 +111,7 @@ def fit_problem(
 
 
 def simulate_experiment(problem: Problem, experiment: Experiment) -> Log:
-    """Simulate the stretches of an experiment, each from its initial state (zero where that is to be estimated)."""
+    """Simulate the segments of an experiment, each from its initial state (zero where that is to be estimated)."""
     delay, start = experiment.delay_s, experiment.initial_state
     options: dict[str, Any] = {
         "delay_s": delay.value if isinstance(delay, Parameter) else delay,
@@ -120,13 +120,13 @@ def simulate_experiment(problem: Problem, experiment: Experiment) -> Log:
     }
     log = experiment.log
     clock = log.time - log.time[0]
-    stretches = [log.between(float(clock[p.start]), float(clock[p.stop - 1])) for p in log.segments]
-    pieces = [simulate(experiment.plant, problem.parameters, stretch, **options) for stretch in stretches]
+    segments = [log.between(float(clock[p.start]), float(clock[p.stop - 1])) for p in log.segments]
+    runs = [simulate(experiment.plant, problem.parameters, segment, **options) for segment in segments]
     signals = {
-        name: Signal(name=name, values=np.concatenate([piece[name] for piece in pieces]), unit=signal.unit)
-        for name, signal in pieces[0].signals.items()
+        name: Signal(name=name, values=np.concatenate([run[name] for run in runs]), unit=signal.unit)
+        for name, signal in runs[0].signals.items()
     }
-    return Log(time=np.concatenate([piece.time for piece in pieces]), signals=signals, source=pieces[0].source)
+    return Log(time=np.concatenate([run.time for run in runs]), signals=signals, source=runs[0].source)
 
 
 def score_problem(problem: Problem, result: Fit, experiments: Sequence[Experiment]) -> list[ModelledOutputs]:

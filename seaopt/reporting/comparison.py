@@ -33,7 +33,7 @@ def experiment_survey(experiment: Experiment, fit: Fit | None = None, stretch_s:
     fit : Fit, optional
         Its delay and gains take the place of the experiment's own.
     stretch_s : float, optional
-        Length of a stretch, as of `seaopt.h1`.
+        Length of a window, as of `seaopt.h1`.
 
     Raises
     ------

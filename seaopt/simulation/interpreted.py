@@ -1,7 +1,7 @@
 """The pass without a compiler: NumPy for linear plants, CasADi's virtual machine for the others.
 
-The log of a linear plant is cut into pieces of `ABREAST` samples, which start at rest and run side by side; what each
-inherits from the one before is added to it (superposition), so that Python's loops are over a piece and over pieces.
+The log of a linear plant is cut into chunks of `ABREAST` samples, which start at rest and run side by side; what each
+inherits from the one before is added to it (superposition), so that Python's loops are over a chunk and over chunks.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ def input_samples(plant: Plant, log: Log) -> tuple[VectorN, ...]:
             row = int(np.flatnonzero(~np.isfinite(values))[0])
             raise LogError(
                 f"{log.source}: input {name} is missing at t = {log.time[row]:g} s (sample {row + 1}); "
-                "cut that stretch off with slice_s, or fill it and say so"
+                "cut that part off with slice_s, or fill it and say so"
             )
         columns.append(values)
     return tuple(columns) if columns else (np.zeros(len(log)),)
@@ -105,7 +105,7 @@ def simulate(
         raise SimulationError(f"delay_s = {delay_s:g} is longer than the log of {log.duration_s:.4g} s; give less")
     model = make_model(plant, params)
     if len(log.segments) > 1:
-        raise LogError(f"{log.source}: has {len(log.segments)} stretches with gaps between; simulate them one by one")
+        raise LogError(f"{log.source}: has {len(log.segments)} segments with gaps between; simulate them one by one")
     x0 = fill_vector("state", plant.states, initial_state)
     u = input_samples(plant, log)
     clock = Clock(period=log.period, hold=hold, delay_s=delay_s)

@@ -132,7 +132,7 @@ def test_what_is_odd_is_noted(file):
 def test_blocks_meet_without_seam(file, monkeypatch):
     import seaopt.logs.formats.text as text
 
-    monkeypatch.setattr(text, "BLOCK_BYTES", 100)
+    monkeypatch.setattr(text, "CHUNK_BYTES", 100)
     values = np.random.default_rng(0).normal(size=(500, 2))
     lines = [f"{i / 1000:.3f},{a!r},{b!r}" for i, (a, b) in enumerate(values.tolist())]
     table = read_table(file("t [s],a,b\n" + "\n".join(lines) + "\n"))

@@ -228,13 +228,13 @@ def _find_speed(log: Log, angle: str, window_s: float) -> tuple[Float[np.ndarray
 
     length = max(5, 2 * round(0.5 * require_number(window_s, "speed_window_s", ControlError) / log.period) + 1)
     speed, has_speed = np.zeros(len(log)), np.zeros(len(log), dtype=bool)
-    for stretch in log.segments:
-        if stretch.stop - stretch.start > length:
-            speed[stretch] = savgol_filter(log[angle][stretch], length, 2, deriv=1, delta=log.period)
-            has_speed[stretch] = True
+    for segment in log.segments:
+        if segment.stop - segment.start > length:
+            speed[segment] = savgol_filter(log[angle][segment], length, 2, deriv=1, delta=log.period)
+            has_speed[segment] = True
     if not np.any(has_speed):
         raise ControlError(
-            f"speed_window_s = {window_s:g}: no stretch of {log.source} is as long; give a shorter window"
+            f"speed_window_s = {window_s:g}: no segment of {log.source} is as long; give a shorter window"
         )
     return speed, has_speed & (np.abs(speed) > SLOWEST * np.quantile(np.abs(speed[has_speed]), 0.9))
 

@@ -1,7 +1,7 @@
-"""CSV and other delimited text, parsed by polars in blocks of whole lines.
+"""CSV and other delimited text, parsed by polars in chunks of whole lines.
 
-A block is parsed to floats at once; only where that fails is it parsed as text, and only where a cell is not a number
-is it walked line by line, to name that cell. Memory holds the wanted columns and one block.
+A chunk is parsed to floats at once; only where that fails is it parsed as text, and only where a cell is not a number
+is it walked line by line, to name that cell. Memory holds the wanted columns and one chunk.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from seaopt.signals import VectorN
 if TYPE_CHECKING:
     import polars as pl
 
-BLOCK_BYTES = 4 << 20
-BLOCKS_AHEAD = 2  # blocks that are parsed while the next one is read and the last one is stored
+CHUNK_BYTES = 4 << 20
+CHUNKS_AHEAD = 2  # chunks that are parsed while the next one is read and the last one is stored
 _RUNS = re.compile(rb"[ \t]+")
 _BEGUN = re.compile(r"[-+]|[-+]?[\d.,]+[eE][-+]?")  # a number that is cut
 _BLANK_LINES = re.compile(rb"(?m)^[ \t]*\r?\n")
@@ -51,14 +51,14 @@ def open_text(path: Path) -> Source:
         path=path,
         format="CSV",
         fields=layout.fields,
-        load=lambda names, _: _load_blocks(layout, names, {}),  # without an index a window reads it whole
+        load=lambda names, _: _load_chunks(layout, names, {}),  # without an index a window reads it whole
         notes=layout.notes,
         constants=layout.constants,
-        load_where=partial(_load_blocks, layout),
+        load_where=partial(_load_chunks, layout),
     )
 
 
-def _load_blocks(layout: TextLayout, names: Sequence[str], where: Where) -> dict[str, VectorN]:
+def _load_chunks(layout: TextLayout, names: Sequence[str], where: Where) -> dict[str, VectorN]:
     """Return columns of the rows in which others have given values; of all rows without any."""
     places = {field.name: (field.position or 1) - 1 for field in layout.fields}
     index, values = {name: places[name] for name in names}, {places[name]: value for name, value in where.items()}
@@ -66,12 +66,12 @@ def _load_blocks(layout: TextLayout, names: Sequence[str], where: Where) -> dict
     size = layout.path.stat().st_size
     pending: deque[tuple[float, Future[dict[str, Any]]]] = deque()
     try:
-        with closing(_read_blocks(layout)) as blocks, ThreadPoolExecutor(BLOCKS_AHEAD) as pool:
-            for number, block in enumerate(blocks):
-                if not block.isspace():
-                    parsed = pool.submit(_parse, layout, block, number, index, values)
-                    pending.append((size / len(block), parsed))
-                if len(pending) > BLOCKS_AHEAD:
+        with closing(_read_chunks(layout)) as chunks, ThreadPoolExecutor(CHUNKS_AHEAD) as pool:
+            for number, chunk in enumerate(chunks):
+                if not chunk.isspace():
+                    parsed = pool.submit(_parse, layout, chunk, number, index, values)
+                    pending.append((size / len(chunk), parsed))
+                if len(pending) > CHUNKS_AHEAD:
                     columns.add(*pending.popleft())
             while pending:
                 columns.add(*pending.popleft())
@@ -81,20 +81,20 @@ def _load_blocks(layout: TextLayout, names: Sequence[str], where: Where) -> dict
 
 
 class _GrowingColumns:
-    """Arrays that grow block by block, sized by the first block so that they are rarely moved."""
+    """Arrays that grow chunk by chunk, sized by the first chunk so that they are rarely moved."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.rows = 0
         self.arrays: dict[str, np.ndarray] = {name: np.empty(0) for name in names}
 
-    def add(self, blocks: float, future: Future[dict[str, Any]]) -> None:
+    def add(self, chunks: float, future: Future[dict[str, Any]]) -> None:
         parsed = future.result()
         count = next(iter(parsed.values())).size
         stop = self.rows + count
         for name, values in parsed.items():
             array = self.arrays[name]
             if not self.rows:  # not filled, so that memory is taken as it is written
-                array = self.arrays[name] = np.empty(int(count * max(blocks, 1.0) * 1.02) + 1)
+                array = self.arrays[name] = np.empty(int(count * max(chunks, 1.0) * 1.02) + 1)
             elif stop > array.size:
                 array.resize(int(stop * 1.25), refcheck=False)
             array[self.rows : stop] = values
@@ -106,74 +106,74 @@ class _GrowingColumns:
         return self.arrays
 
 
-def _read_blocks(layout: TextLayout) -> Generator[bytes]:
-    """Return blocks of whole lines as UTF-8."""
+def _read_chunks(layout: TextLayout) -> Generator[bytes]:
+    """Return chunks of whole lines as UTF-8."""
     wide = layout.encoding == "utf-16"
     with layout.path.open(encoding=layout.encoding, newline="\n") if wide else layout.path.open("rb") as stream:
         for _ in range(layout.first):
             stream.readline()
         number = 0
-        while block := _read_block(stream, layout.encoding):
-            _check_lines(layout, block, number)
+        while chunk := _read_chunk(stream, layout.encoding):
+            _check_lines(layout, chunk, number)
             if not number:
-                block = block.removeprefix(codecs.BOM_UTF8)
-            if len(block) < BLOCK_BYTES:  # the last one may end in blank lines, and in the end-of-file mark of DOS
-                block = block.rstrip(b"\x1a \t\r\n") + b"\n"
-            yield block
+                chunk = chunk.removeprefix(codecs.BOM_UTF8)
+            if len(chunk) < CHUNK_BYTES:  # the last one may end in blank lines, and in the end-of-file mark of DOS
+                chunk = chunk.rstrip(b"\x1a \t\r\n") + b"\n"
+            yield chunk
             number += 1
 
 
-def _read_block(stream: IO[Any], encoding: str) -> bytes:
-    """Return the next block, up to the end of a line."""
+def _read_chunk(stream: IO[Any], encoding: str) -> bytes:
+    """Return the next chunk, up to the end of a line."""
     if encoding == "utf-16":
-        return (stream.read(BLOCK_BYTES) + stream.readline(MAX_LINE + 1)).encode()
+        return (stream.read(CHUNK_BYTES) + stream.readline(MAX_LINE + 1)).encode()
     start = stream.tell()
-    stream.seek(start + BLOCK_BYTES)
+    stream.seek(start + CHUNK_BYTES)
     stream.readline(MAX_LINE + 1)
     end = stream.tell()
     stream.seek(start)
-    block = stream.read(end - start)
-    return block.decode(WINDOWS).encode() if encoding == WINDOWS else block
+    chunk = stream.read(end - start)
+    return chunk.decode(WINDOWS).encode() if encoding == WINDOWS else chunk
 
 
 def _find_first_line(layout: TextLayout, number: int) -> int:
-    """Return the line on which a block begins; counted only to name a line, as it takes a while."""
-    with closing(_read_blocks(layout)) as blocks:
-        return layout.first + 1 + sum(block.count(b"\n") for block in islice(blocks, number))
+    """Return the line on which a chunk begins; counted only to name a line, as it takes a while."""
+    with closing(_read_chunks(layout)) as chunks:
+        return layout.first + 1 + sum(chunk.count(b"\n") for chunk in islice(chunks, number))
 
 
-def _check_lines(layout: TextLayout, block: bytes, number: int) -> None:
+def _check_lines(layout: TextLayout, chunk: bytes, number: int) -> None:
     start = 0
-    while len(block) - start > MAX_LINE:
-        end = block.rfind(b"\n", start, start + MAX_LINE)
+    while len(chunk) - start > MAX_LINE:
+        end = chunk.rfind(b"\n", start, start + MAX_LINE)
         if end < start:
-            raise line_length_error(layout.path, _find_first_line(layout, number) + block.count(b"\n", 0, start))
+            raise line_length_error(layout.path, _find_first_line(layout, number) + chunk.count(b"\n", 0, start))
         start = end + 1
 
 
 def _parse(
-    layout: TextLayout, block: bytes, number: int, index: Mapping[str, int], where: Mapping[int, str | float]
+    layout: TextLayout, chunk: bytes, number: int, index: Mapping[str, int], where: Mapping[int, str | float]
 ) -> dict[str, Any]:
-    """Return the columns of a block, by name; with `where` of the rows in which columns have these values. Texts are
+    """Return the columns of a chunk, by name; with `where` of the rows in which columns have these values. Texts are
     parsed where floats alone are not there, or blank lines are; what other rows hold is not looked at.
     """
     import polars as pl
 
     def error_at(reason: str) -> LogError:
-        return _cell_error(layout, block, number, {} if where else index, reason)
+        return _cell_error(layout, chunk, number, {} if where else index, reason)
 
     parsed: dict[str, Any] = {}
     try:
-        frame = None if where else _parse_frame(layout, block, index.values(), pl.Float64)
+        frame = None if where else _parse_frame(layout, chunk, index.values(), pl.Float64)
     except (pl.exceptions.PolarsError, ValueError):
         frame = None
-    if frame is not None and not (frame.to_series(0).null_count() and _BLANK_LINES.search(block)):
+    if frame is not None and not (frame.to_series(0).null_count() and _BLANK_LINES.search(chunk)):
         parsed = {name: frame[f"column_{at}"].to_numpy() for name, at in index.items()}
         if any(np.isinf(values).any() for values in parsed.values()):
             raise error_at("a cell is infinite")
         return parsed
     try:
-        frame = _parse_frame(layout, _BLANK_LINES.sub(b"", block), {*index.values(), *where}, pl.String)
+        frame = _parse_frame(layout, _BLANK_LINES.sub(b"", chunk), {*index.values(), *where}, pl.String)
     except (pl.exceptions.PolarsError, ValueError) as error:
         raise error_at(summarise_error(error)) from error
     for at, value in where.items():
@@ -198,14 +198,14 @@ def _parse(
     return parsed
 
 
-def _parse_frame(layout: TextLayout, block: bytes, columns: Collection[int], kind: Any) -> pl.DataFrame:
+def _parse_frame(layout: TextLayout, chunk: bytes, columns: Collection[int], kind: Any) -> pl.DataFrame:
     import polars as pl
 
     delimiter, wanted = layout.delimiter, set(columns)
     if delimiter == " ":
-        delimiter, block = "\t", re.sub(rb"(?m)^\t|\t(?=\r?$)", b"", _RUNS.sub(b"\t", block))
+        delimiter, chunk = "\t", re.sub(rb"(?m)^\t|\t(?=\r?$)", b"", _RUNS.sub(b"\t", chunk))
     return pl.read_csv(
-        block,
+        chunk,
         has_header=False,
         separator=delimiter,
         schema={f"column_{at}": kind if at in wanted else pl.String for at in range(layout.width)},
@@ -217,9 +217,9 @@ def _parse_frame(layout: TextLayout, block: bytes, columns: Collection[int], kin
     )
 
 
-def _cell_error(layout: TextLayout, block: bytes, number: int, index: Mapping[str, int], reason: str) -> LogError:
+def _cell_error(layout: TextLayout, chunk: bytes, number: int, index: Mapping[str, int], reason: str) -> LogError:
     """Return the error that names the first cell, or row, that cannot be read."""
-    lines = block.decode().rstrip().split("\n")
+    lines = chunk.decode().rstrip().split("\n")
     for line, text in enumerate(lines, start=_find_first_line(layout, number)):
         row = split_cells(text.rstrip("\r"), layout.delimiter) if text.strip() else []
         if len(row) > layout.width:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-STEPS_PER_BLOCK = 100_000  # steps of time that are checked in one go, so that they stay in the cache
+STEPS_PER_CHUNK = 100_000  # steps of time that are checked in one go, so that they stay in the cache
 
 
 @record(eq=False)
@@ -407,9 +407,9 @@ def _describe_range(values: VectorN) -> tuple[str, int]:
 
 
 def _steps(time: VectorN) -> Iterator[Float[np.ndarray, " _"]]:
-    """Return the steps of time in blocks that stay in the cache, where they are looked at more than once."""
-    for start in range(0, time.size - 1, STEPS_PER_BLOCK):
-        yield np.diff(time[start : start + STEPS_PER_BLOCK + 1])
+    """Return the steps of time in chunks that stay in the cache, where they are looked at more than once."""
+    for start in range(0, time.size - 1, STEPS_PER_CHUNK):
+        yield np.diff(time[start : start + STEPS_PER_CHUNK + 1])
 
 
 def _increases(time: VectorN) -> bool:
@@ -435,9 +435,9 @@ def _describe_fault(time: VectorN) -> str:
 
 def _measure_steps(time: VectorN) -> tuple[float, float]:
     """Return the sample period and the step above which there is a gap: see `measure_steps`. The median that tells the
-    gaps is over at most `STEPS_PER_BLOCK` steps; the odd stride meets both of two steps that alternate.
+    gaps is over at most `STEPS_PER_CHUNK` steps; the odd stride meets both of two steps that alternate.
     """
-    first = np.arange(0, time.size - 1, (time.size - 2) // STEPS_PER_BLOCK | 1)
+    first = np.arange(0, time.size - 1, (time.size - 2) // STEPS_PER_CHUNK | 1)
     longest = GAP * float(np.median(time[first + 1] - time[first]))
     total, count = 0.0, 0
     for step in _steps(time):

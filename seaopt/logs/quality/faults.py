@@ -15,7 +15,7 @@ from seaopt.records import record
 from seaopt.signals import RowsK, VectorK, VectorN
 
 LEVEL_SAMPLES = 50_000  # samples that are enough to see a quantisation step
-STILLNESS_BLOCK = 64  # samples over which a channel's stillness is averaged
+STILLNESS_WINDOW = 64  # samples over which a channel's stillness is averaged
 FEW_LEVELS = 8  # a channel of so few values is switched, not clipped
 PILE = 6.0  # times more samples at a rail than at each of the levels below it
 OUTLYING = 6.0  # robust standard deviations (Hampel)
@@ -85,12 +85,12 @@ def find_repeats(values: VectorN) -> RowRanges:
 
 
 def measure_stillness(values: VectorN) -> float:
-    """Return the share of samples equal to the last, in the median block of 64: what is usual for the channel."""
+    """Return the share of samples equal to the last, in the median window of 64: what is usual for the channel."""
     same = values[1:] == values[:-1]
-    blocks = same.size // STILLNESS_BLOCK
-    if not blocks:
+    windows = same.size // STILLNESS_WINDOW
+    if not windows:
         return float(np.mean(same))
-    return float(np.median(np.mean(same[: blocks * STILLNESS_BLOCK].reshape(blocks, STILLNESS_BLOCK), axis=1)))
+    return float(np.median(np.mean(same[: windows * STILLNESS_WINDOW].reshape(windows, STILLNESS_WINDOW), axis=1)))
 
 
 def find_quantisation(values: VectorN) -> float:
@@ -216,7 +216,7 @@ def find_counter_losses(values: VectorN) -> CounterLosses | None:
     """Return the samples that a counter shows to be missing; None where the channel does not count. A counter goes up
     by one, at regular intervals, and may wrap.
     """
-    if values.size < FEWEST_SAMPLES or np.any(values[:STILLNESS_BLOCK] != np.round(values[:STILLNESS_BLOCK])):
+    if values.size < FEWEST_SAMPLES or np.any(values[:STILLNESS_WINDOW] != np.round(values[:STILLNESS_WINDOW])):
         return None  # NaN is not equal to itself
     if not np.all((np.abs(values) < LARGEST_COUNT) & (values == np.round(values))):
         return None

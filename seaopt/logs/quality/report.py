@@ -29,7 +29,7 @@ from seaopt.logs.quality.findings import (
     sort_findings,
 )
 from seaopt.logs.quality.lags import ChannelPair, correlate_channels
-from seaopt.logs.quality.spectra import FEWEST_SEGMENTS, SHORTEST_SEGMENT, Spectra, compute_spectra, find_hum
+from seaopt.logs.quality.spectra import FEWEST_WINDOWS, SHORTEST_WINDOW, Spectra, compute_spectra, find_hum
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import Result, Worded, record
 from seaopt.signals import HOLDING_NAMES, INPUT_NAMES, INPUT_UNITS, SAME_SIGN, Recording, VectorN
@@ -38,7 +38,7 @@ QUALITY_SCHEMA = "seaopt/quality/1"
 CHANNELS, PAIRS = 0.6, 0.4  # of the time
 MOVING_STD = 0.05  # of its standard deviation over the log: what makes a channel move during a run of another
 MOST_PAIRED = 100  # outputs; of more only `SAME_SIGN` are correlated with each other
-ENOUGH_SAMPLES = FEWEST_SEGMENTS * SHORTEST_SEGMENT  # for spectra, in one segment
+ENOUGH_SAMPLES = FEWEST_WINDOWS * SHORTEST_WINDOW  # for spectra, in one segment
 
 
 @record(eq=False, repr=False)
@@ -228,8 +228,8 @@ def _find_stuck_runs(channel: ChannelQuality, channels: Mapping[str, ChannelQual
         return runs
 
     def moves(start: int, stop: int) -> bool:
-        segments = [(values[start:stop], std) for values, std in moving]
-        return any(np.nanstd(part) > MOVING_STD * std for part, std in segments if np.any(np.isfinite(part)))
+        windows = [(values[start:stop], std) for values, std in moving]
+        return any(np.nanstd(part) > MOVING_STD * std for part, std in windows if np.any(np.isfinite(part)))
 
     pairs = zip(runs.start.tolist(), runs.stop.tolist(), strict=True)
     return runs.where(np.array([moves(start, stop) for start, stop in pairs], dtype=bool))

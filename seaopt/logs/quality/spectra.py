@@ -1,7 +1,7 @@
-r"""Spectra of a log's channels on the same segments: mains hum, excitation, coherence and delays.
+r"""Spectra of a log's channels on the same windows: mains hum, excitation, coherence and delays.
 
-Hann-windowed segments that overlap by half (Welch 1967), none across a gap. Long logs are sampled: at most 64
-segments of at most 32,768 samples, spread over the log.
+Windows under Hann's taper that overlap by half (Welch 1967), none across a gap. Long logs are sampled: at most 64
+windows of at most 32,768 samples, spread over the log.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ from seaopt import welch
 from seaopt.records import record
 from seaopt.signals import VectorM, VectorN
 
-SHORTEST_SEGMENT, LONGEST_SEGMENT = 32, 1 << 15  # samples in a segment
-FEWEST_SEGMENTS, MOST_SEGMENTS = 4, 64
+SHORTEST_WINDOW, LONGEST_WINDOW = 32, 1 << 15  # samples in a window
+FEWEST_WINDOWS, MOST_WINDOWS = 4, 64
 MAINS_HZ = (50.0, 60.0)
 HARMONICS = 5
 BESIDE_HZ = 12.0  # from a line: where the noise floor is read
 LINE_HEIGHT = 4.0  # times the noise floor: 6 dB
 OTHER_LINES = 3  # lines beside the mains' in the same channel that make a multisine
-BRIDGED_SHARE = 0.02  # share of a segment's samples that may be missing: they are bridged by lines
+BRIDGED_SHARE = 0.02  # share of a window's samples that may be missing: they are bridged by lines
 
 
 @record(eq=False)
 class Spectra:
-    """Windowed spectra of every channel, one row per segment, from 0 Hz on."""
+    """Tapered spectra of every channel, one row per window, from 0 Hz on."""
 
     frequency_hz: VectorM
     period: float  # seconds between samples
-    # channels that have samples missing in most segments are left out, and then segments that have holes
+    # channels that have samples missing in most windows are left out, and then windows that have holes
     channels: Mapping[str, Complex[np.ndarray, "d m"]]
 
     @property
-    def segments(self) -> int:
-        """Number of segments."""
+    def windows(self) -> int:
+        """Number of windows."""
         return next((len(rows) for rows in self.channels.values()), 0)
 
     @property
     def averages(self) -> float:
-        """Independent averages that the overlapping segments are worth."""
-        return welch.count_averages(self.segments)
+        """Independent averages that the overlapping windows are worth."""
+        return welch.count_averages(self.windows)
 
     def power(self, name: str) -> VectorM:
         """Return the mean power of each line, up to a factor common to all channels."""
@@ -60,24 +60,24 @@ class Spectra:
 def compute_spectra(channels: Mapping[str, VectorN], segments: Sequence[slice], period: float) -> Spectra | None:
     """Return the channels' spectra over `segments` (rows) sampled every `period` s; None without a segment."""
     total = sum(segment.stop - segment.start for segment in segments)
-    length = 2 * (min(max(total // 16, SHORTEST_SEGMENT), LONGEST_SEGMENT) // 2)
-    starts = welch.thin(welch.list_starts(segments, length), MOST_SEGMENTS)
-    if len(starts) < FEWEST_SEGMENTS:
+    length = 2 * (min(max(total // 16, SHORTEST_WINDOW), LONGEST_WINDOW) // 2)
+    starts = welch.thin(welch.list_starts(segments, length), MOST_WINDOWS)
+    if len(starts) < FEWEST_WINDOWS:
         return None
     cuts = {name: np.stack([values[start : start + length] for start in starts]) for name, values in channels.items()}
-    # A channel with holes everywhere is left out; then a segment with a hole in any other channel.
+    # A channel with holes everywhere is left out; then a window with a hole in any other channel.
     holed = {name: np.mean(~np.isfinite(cut), axis=1) > BRIDGED_SHARE for name, cut in cuts.items()}
     kept = [name for name in cuts if np.mean(holed[name]) <= 0.5]
     whole = ~np.any([holed[name] for name in kept], axis=0) if kept else np.zeros(len(starts), dtype=bool)
-    if np.count_nonzero(whole) < FEWEST_SEGMENTS:
+    if np.count_nonzero(whole) < FEWEST_WINDOWS:
         return None
-    window = welch.hann(length)
-    transforms = {name: welch.transform(_bridge(cuts[name][whole]), window) for name in kept}
+    taper = welch.hann(length)
+    transforms = {name: welch.transform(_bridge(cuts[name][whole]), taper) for name in kept}
     return Spectra(frequency_hz=np.fft.rfftfreq(length, period), period=period, channels=transforms)
 
 
 def _bridge(cut: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "d n"]:
-    """Put straight lines across the missing samples of segments, in place."""
+    """Put straight lines across the missing samples of windows, in place."""
     rows = np.arange(cut.shape[1])
     for row in np.flatnonzero(~np.all(np.isfinite(cut), axis=1)):
         good = np.flatnonzero(np.isfinite(cut[row]))
@@ -96,14 +96,14 @@ class Hum:
 
 
 def find_hum(spectra: Spectra, name: str, inputs: Sequence[str]) -> Hum | None:
-    """Return the mains' lines of a channel, None where there are none or the segments are too short to tell. A line
-    stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median segment: what comes and goes, such as
+    """Return the mains' lines of a channel, None where there are none or the windows are too short to tell. A line
+    stands 6 dB over the medians of the spectrum within 12 Hz of it, in the median window: what comes and goes, such as
     a chirp, does not count, nor what an input is coherent with, such as a resonance there. Where other lines stand out
     as well it is a multisine.
     """
     f = spectra.frequency_hz
     width = f[1] - f[0]
-    if width > 1.5 or spectra.segments < 6:
+    if width > 1.5 or spectra.windows < 6:
         return None
     square = welch.square(spectra.channels[name])
     steady = np.median(square, axis=0)

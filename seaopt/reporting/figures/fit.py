@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WINDOW_S = 1.0  # of the stretch with the largest motion
-SPECTRUM_STRETCHES = 8  # of the log, for a spectrum, that do not overlap
-LONGEST_STRETCH = 4096  # samples
+SPECTRUM_WINDOWS = 8  # of the log, for a spectrum, that do not overlap
+LONGEST_WINDOW = 4096  # samples
 FEWEST_SAMPLES = 32  # of a spectrum
 Z95 = 1.959964  # standard deviations of a 95 % interval
 
@@ -132,13 +132,12 @@ def amplitude_density(values: VectorN, period: float) -> tuple[VectorM, VectorM]
     run = _find_longest_run(values)
     if run.size < FEWEST_SAMPLES:
         raise EstimationError(
-            f"a run of {run.size} samples without a gap is too short for a spectrum; choose a longer stretch with "
-            "slice_s"
+            f"a run of {run.size} samples without a gap is too short for a spectrum; choose a longer part with slice_s"
         )
-    length = min(max(run.size // SPECTRUM_STRETCHES, FEWEST_SAMPLES), LONGEST_STRETCH) // 2 * 2
-    window, starts = welch.hann(length), welch.list_starts([slice(0, run.size)], length)
-    spectra = welch.transform(np.stack([run[start : start + length] for start in starts]), window)
-    density = np.mean(welch.square(spectra), axis=0) * (2.0 * period / np.sum(window**2))
+    length = min(max(run.size // SPECTRUM_WINDOWS, FEWEST_SAMPLES), LONGEST_WINDOW) // 2 * 2
+    taper, starts = welch.hann(length), welch.list_starts([slice(0, run.size)], length)
+    spectra = welch.transform(np.stack([run[start : start + length] for start in starts]), taper)
+    density = np.mean(welch.square(spectra), axis=0) * (2.0 * period / np.sum(taper**2))
     density[-1] *= 0.5  # the Nyquist frequency has no other side
     return np.fft.rfftfreq(length, period)[1:], np.sqrt(density[1:])
 
