@@ -200,8 +200,8 @@ def _read_stage(session: Session, path: Path) -> Source:
         stated = {name: content["mpc"]["spec"][name] for name in OF_A_STAGE}
         return design_mpc(replace(problem, mpc=replace(problem.mpc, **stated)), session.parameters())
     if problem.schedule is not None:
-        others = problem.robust_to(session.parameters())
-        return ScheduledController.from_dict(content, problem.design_plant, session.values(), others)
+        robust_to = problem.robust_to(session.parameters())
+        return ScheduledController.from_dict(content, problem.design_plant, session.values(), robust_to)
     return Controller.from_dict(content, list_plants(problem, session.parameters())[0], session.values())
 
 

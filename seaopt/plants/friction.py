@@ -173,11 +173,6 @@ def _steepest_wave(plant: Plant, reading: Reading, p: Any) -> Any:
     return getattr(p, reading.wave) * ca.fmax(ca.sqrt(size + LEAST_SIZE**2) - jump, 0.0)
 
 
-def _list_waves(plant: Plant, params: CompletedParameters) -> list[Reading]:
-    """Return the readings of a plant whose waves are there."""
-    return [reading for reading in plant.followed.values() if any(params[size].value for size in reading.sizes)]
-
-
 def split_friction(plants: Mapping[str, Plant], params: ParameterSet, varied: Collection[str] = ()) -> dict[str, Plant]:
     """Return the plants, one with friction in each of its states, as NAME sliding and NAME stuck (`name_states`)."""
     return {
@@ -289,7 +284,8 @@ def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = (
     values = plant.complete(params)
     flattest, steepest = friction_slopes(plant, values)
     holds = bool(np.any(flattest != steepest)) or any(find_bristle_stiffness(plant, values))
-    return holds or bool(_list_waves(plant, values)) or bool(_friction_parameters(plant) & set(varied))
+    waves = any(values[size].value for reading in plant.followed.values() for size in reading.sizes)
+    return holds or waves or bool(_friction_parameters(plant) & set(varied))
 
 
 def find_bristle_stiffness(plant: Plant, params: ParameterSet) -> list[float]:

@@ -250,8 +250,8 @@ def _correct(layout: Layout, z: Any, y: Any, w: Any, sensors: Any) -> Any:
     for o in range(ny):
         value = gain[o] * y[o, 0] + offset[o] + ca.mtimes(coefficients[o, :], basis) - measured[o]
         sensor_columns = ca.vertcat(1.0, basis, y[o, 0])
-        before = ca.MX.zeros(layout.shared + nx + o * layout.own)
-        after = ca.MX.zeros((ny - 1 - o) * layout.own)
+        before = ca.MX.zeros(layout.shared + nx + o * layout.per_output)
+        after = ca.MX.zeros((ny - 1 - o) * layout.per_output)
         derivative = gain[o] * y[o, 1:] + ca.vertcat(before, sensor_columns, after).T
         rows.append(present[o] * ca.horzcat(value, derivative))
     v = ca.vertcat(*rows)
@@ -370,10 +370,10 @@ def _columns(
     v[:, :, 0] = point.read(y.T, segment, slice(0, len(y))).T - measured
     v[:, :, 1 : 1 + dy.shape[2]] = point.gain[:, None] * dy
     for o in range(layout.ny):
-        first = 1 + layout.shared + layout.nx + (o * layout.own if layout.corrected else 0)
+        first = 1 + layout.shared + layout.nx + (o * layout.per_output if layout.corrected else 0)
         v[:, o, first] += 1.0
         v[:, o, first + 1 : first + 1 + point.drift_terms] += basis
-        v[:, o, first + layout.own - 1] += y[:, o]
+        v[:, o, first + layout.per_output - 1] += y[:, o]
     v[~present] = 0.0
     if len(weights.sections):
         from scipy.signal import sosfilt

@@ -179,19 +179,19 @@ class Layout:
     corrected: bool
 
     @property
-    def own(self) -> int:
+    def per_output(self) -> int:
         """Columns that belong to one output."""
         return 2 + self.drift_terms
 
     @property
     def states(self) -> int:
         """The state and its derivatives, in columns."""
-        return 1 + self.shared + self.nx + (self.ny * self.own if self.corrected else 0)
+        return 1 + self.shared + self.nx + (self.ny * self.per_output if self.corrected else 0)
 
     @property
     def columns(self) -> int:
         """Columns of v."""
-        return 1 + self.shared + self.nx + (self.ny if self.corrected else 1) * self.own
+        return 1 + self.shared + self.nx + (self.ny if self.corrected else 1) * self.per_output
 
 
 @record(eq=False)

@@ -387,7 +387,7 @@ def _numbers(stored: Controller, law: RunnableLaw, number: Writer) -> dict[str, 
     def row(values: Iterable[float]) -> str:
         return ", ".join(number(float(value)) for value in values) or number(0.0)
 
-    per_reference, per_measurement = law.rest()
+    per_reference, per_measurement = law.find_rest()
     transfer_functions = multiply_out(stored.law, stored.link)
     b, d, resting = (
         np.reshape(part, (-1, law.measured)).T for part in (law.b_measurement, law.d_measurement, per_measurement)

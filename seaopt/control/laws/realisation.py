@@ -295,7 +295,7 @@ class RunnableLaw(Guarded):
             f"{1 / self.sample_time_s:.6g} Hz, {limit}"
         )
 
-    def rest(self) -> tuple[Vector, Float[np.ndarray, "n ..."]]:
+    def find_rest(self) -> tuple[Vector, Float[np.ndarray, "n ..."]]:
         """Return x per reference and per measurement (counted negative) at rest, integrators zero."""
         m, n = self.integrators, self.c.size
         out = np.zeros((n, 1 + self.measured))
@@ -320,7 +320,7 @@ class RunnableLaw(Guarded):
         outside the gate's range, or the current is above the limit.
         """
         reference, measurement, effort, seen = self.begin(reference, measurement, current_A, readings)
-        per_reference, per_measurement = self.rest()
+        per_reference, per_measurement = self.find_rest()
         x = per_reference * reference - np.dot(per_measurement, measurement)
         if self.integrators:
             x[0] = effort - self._find_force(x, reference, measurement)

@@ -90,7 +90,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
     """Return the numbers of a controller's C code."""
     kalman, prediction, spec, outputs = mpc.kalman, mpc.prediction, mpc.spec, mpc.prediction.outputs
     sizes = {
-        "STATES": len(kalman.A), "PLANT_STATES": mpc.rest.size, "DELAY": kalman.delay_samples,
+        "STATES": len(kalman.A), "PLANT_STATES": mpc.rest_state.size, "DELAY": kalman.delay_samples,
         "COMPUTE_DELAY_SAMPLES": mpc.compute_delay_samples,
         "KNOTS": prediction.knots.size, "ROWS": len(prediction.rows), "SLEWS": len(prediction.M),
         "SIGNALS": len(outputs.names), "SAMPLES": outputs.samples, "PREVIEW": spec.preview_samples,
@@ -104,7 +104,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
     }  # fmt: skip
     arrays = {
         "A": kalman.A, "B": kalman.B[:, 0], "late": kalman.late[:, 0], "C": kalman.C[0],
-        "gain": kalman.gain[:, 0], "rest": mpc.rest,
+        "gain": kalman.gain[:, 0], "rest": mpc.rest_state,
         "F": prediction.F, "M": prediction.M, "R": prediction.R, "shift": mpc.shift, "free": outputs.free,
         "forced": outputs.forced, "static": outputs.static, "centre": outputs.middle / outputs.half,
     }  # fmt: skip

@@ -34,7 +34,7 @@ class ForcePlant:
     sample_time_s: float
 
     @property
-    def rest(self) -> State:
+    def rest_state(self) -> State:
         """The state at rest per unit of command."""
         return np.linalg.solve(np.eye(self.b.size) - self.a, self.b + self.late)
 

@@ -96,7 +96,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
         What the quadratic program minimises, and its limits.
     static_gain : float
         N/A.
-    rest : array, shape (nx,)
+    rest_state : array, shape (nx,)
         The plant's state at rest per ampere.
     shift : array, shape (n, n)
         Shifts the plan at the knots by one sample.
@@ -120,7 +120,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
     regulator: Regulator
     prediction: HorizonProgram
     static_gain: float
-    rest: Float[np.ndarray, " nx"]
+    rest_state: Float[np.ndarray, " nx"]
     shift: Float[np.ndarray, "n n"]
     solver: QuadraticProgram
     gate: PlausibilityGate | None = None
@@ -305,7 +305,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
         corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
         drift = float(ahead[-1])
         u_s, targets = self._targets(drift, references, most)
-        xi = ahead[: self.rest.size] - self.rest * (u_s + drift)
+        xi = ahead[: self.rest_state.size] - self.rest_state * (u_s + drift)
         q, low, high = self.program(xi, u_s, last, drift, targets, most)
         shifted = self.shift @ state.plan
         solution = self.solver.solve(q, low, high, state.sides, self.spec.max_iterations)
@@ -413,7 +413,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
     def unlimited(self) -> Law:
         """Return the plan as long as no limit is active: from its reference and the measurement to current."""
         gains = -np.linalg.solve(self.prediction.H, self.prediction.F)[0] * self.command_limit
-        x_rest, kalman, start = self.rest, self.kalman, self.kalman.start
+        x_rest, kalman, start = self.rest_state, self.kalman, self.kalman.start
         n, delay = len(kalman.A), kalman.delay_samples
         acting = max(delay + bool(np.any(kalman.late)), 1)  # commands that still act, of which the last is one
 
@@ -590,7 +590,7 @@ def _design(
         regulator=regulator,
         prediction=prediction,
         static_gain=gain,
-        rest=sampled.rest,
+        rest_state=sampled.rest_state,
         shift=np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)]),
         solver=factor_program(stack_hessian(prediction), prediction.rows),
         gate=gate,

@@ -112,7 +112,7 @@ def bound_outputs(
         names=tuple(bounds),
         middle=ends.mean(axis=1),
         half=half,
-        static=(C @ plant.rest + D) / half,
+        static=(C @ plant.rest_state + D) / half,
         free=(np.stack(free, axis=1) / half[:, None, None]).reshape(-1, nx + 1),
         forced=(limit * np.stack(forced, axis=1) / half[:, None, None]).reshape(-1, W.shape[1]),
     )

@@ -122,7 +122,7 @@ def _track(plant: ForcePlant, candidate: Regulator, f: VectorM) -> VectorM:
     """Return abs(F/F_ref); whole samples of delay, which do not change it, are left out."""
     (A, b), row = plant.add_command(), np.append(plant.c, 0.0)
     closed = A - np.outer(b, np.append(candidate.K_x, candidate.K_u))
-    drive = b * (candidate.K_x @ (plant.rest / plant.gain) + candidate.K_u / plant.gain)
+    drive = b * (candidate.K_x @ (plant.rest_state / plant.gain) + candidate.K_u / plant.gain)
     inner = np.exp(2j * np.pi * f * plant.sample_time_s)[:, None, None] * np.eye(b.size) - closed
     return np.abs(np.linalg.solve(inner, drive[None, :, None])[..., 0] @ row)
 

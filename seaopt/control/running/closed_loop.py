@@ -44,7 +44,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
 from seaopt.plants.equations.declaration import ENERGY
 from seaopt.plants.friction import SLIDING, friction_states
-from seaopt.plants.plant import Matrices, dynamics_function, name_input
+from seaopt.plants.plant import dynamics_function, name_input
 from seaopt.records import record
 from seaopt.units import name_command, unit_after
 
@@ -188,7 +188,8 @@ def run_loop(
         raise SimulationError(f"start has {job.start.x.shape[0]} runs and params {runs}; give one state per run")
     if rtol is None:
         rtol = STICKING_RTOL if loop.sticks else RTOL
-    matrices = _linearise_at_rest(loop, values[0])
+    # Friction that sticks has no slope at rest.
+    matrices = state_space(friction_states(loop.plant)[SLIDING] if loop.sticks else loop.plant, values[0])
     substeps, before, wall_s = _first_guess(matrices[0], loop.law.sample_time_s, rtol), None, 0.0
     motion = _bound_motion(matrices[0], matrices[1][:, 0], loop.law.sample_time_s)
     pushes = [_push_at_start(loop.plant, each, job.start.x[run]) for run, each in enumerate(values)]
@@ -326,13 +327,6 @@ def _lags(loop: SampledLoop, params: Sequence[CompletedParameters]) -> dict[str,
         newer = loop.delay_samples + whole
         lag[run, 0, newer + (late_s[run] > 0.0)] = lag[run, 1, newer] = 1.0
     return {"lag": lag.reshape(len(params), -1), "late_s": late_s}
-
-
-def _linearise_at_rest(loop: SampledLoop, params: CompletedParameters) -> Matrices:
-    """Return (A, B, C, D) at rest, of the sliding plant where friction sticks by no slope."""
-    if not loop.sticks:
-        return state_space(loop.plant, params)
-    return state_space(friction_states(loop.plant)[SLIDING], params)
 
 
 def _first_guess(a: Float[np.ndarray, "nx nx"], period: float, rtol: float) -> int:

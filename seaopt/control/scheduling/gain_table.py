@@ -226,7 +226,7 @@ def _find_order(table: GainTable) -> StepOrder:
 @lru_cache(maxsize=16)
 def _list_states(table: GainTable) -> tuple[str, ...]:
     """Return the names of what the law of a table keeps, once."""
-    return tuple(table.order.rest(0.0, [0.0] * table.order.measured))
+    return tuple(table.order.find_rest(0.0, [0.0] * table.order.measured))
 
 
 @lru_cache(maxsize=16)

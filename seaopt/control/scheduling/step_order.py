@@ -76,7 +76,7 @@ class StepOrder:
         """How many signals it reads."""
         return 1 + (self.speed is not None) + (self.link is not None)
 
-    def rest(self, reference: Any, readings: Sequence[Any]) -> dict[str, Any]:
+    def find_rest(self, reference: Any, readings: Sequence[Any]) -> dict[str, Any]:
         """Return the states at rest under constant inputs, integrals at zero."""
         x = {"integral": 0.0, "reference": reference, "measurement": readings[0]}
         if not self.integrates:
@@ -111,7 +111,7 @@ class StepOrder:
 
     def continue_from(self, g: Numbers, effort: Any, reference: Any, readings: Sequence[Any]) -> dict[str, Any]:
         """Return the states at rest from which the next effort is one that was, where something integrates."""
-        x = self.rest(reference, readings)
+        x = self.find_rest(reference, readings)
         if self.link is not None:
             effort = effort - self._feed_link(g, x, {}, readings[-1])
         outer, scale = "speed_integral" if self.speed_integrates else "integral", 1.0

@@ -227,7 +227,7 @@ class _Scan:
         return self.plant * complex(self.terms.series[self.at])
 
     @property
-    def rest(self) -> complex:
+    def constant(self) -> complex:
         """B of the design plant at the bandwidth."""
         return complex(self.grid.plants.alone.at(0).add_constant(self.c_v, 0.0 * self.c_v)[self.at])
 
@@ -281,7 +281,7 @@ def _scan_fixed_weight(scan: _Scan) -> tuple[Values, GainRows]:
     grids = np.meshgrid(k_d, _list_integrals(scan), _list_weights(scan.task), indexing="ij")
     k_d, k_i, weight = (values.ravel() for values in grids)
     gains = np.column_stack([0.0 * k_d, k_i, k_d, 0.0 * k_d, weight * k_d])[(k_d > 0.0) | (weight == weight[0])]
-    back = scan.rest + scan.through * scan.measurement(gains)[:, scan.at]
+    back = scan.constant + scan.through * scan.measurement(gains)[:, scan.at]
     ahead = scan.through * complex(scan.terms.prefilter[scan.at])
     k_p = solve_bandwidth(scan.through, ahead, ahead * scan.reference(gains)[:, scan.at], back)
     gains = np.tile(gains, (2, 1))
@@ -306,7 +306,7 @@ def _scan_free_weight(scan: _Scan) -> tuple[Values, GainRows]:
     gains, c_y, merit = gains[chosen], c_y[chosen], merit[chosen]
     gains[:, W_C] = np.resize(weights, chosen.size) * gains[:, K_D]
     whole = scan.reference(gains)[:, scan.at]
-    distance = scan.rest + scan.plant * c_y[:, scan.at]
+    distance = scan.constant + scan.plant * c_y[:, scan.at]
     size = np.abs(distance) / (np.sqrt(2.0) * abs(scan.through * scan.terms.prefilter[scan.at]))
     with np.errstate(invalid="ignore"):
         gains[:, W_R] = np.real(whole) + np.resize([-1.0, 1.0], chosen.size) * np.sqrt(size**2 - np.imag(whole) ** 2)

@@ -148,7 +148,8 @@ def _find_delayed(log: DescribedLog, logs: Sequence[DescribedLog]) -> DescribedL
 
 def _describe_fit(logs: Sequence[DescribedLog]) -> list[str]:
     """Return [fit], where the logs ask for it."""
-    lasts, outliers = all(_lasts(log) for log in logs), sum(log.traits.outliers for log in logs)
+    lasts = all(log.survey.columns[0].values.size / log.rate_hz >= HOLDOUT_S for log in logs)
+    outliers = sum(log.traits.outliers for log in logs)
     far, rows = outliers >= OUTLIERS, list[str]()
     if lasts:
         rows.append(_comment("holdout = 0.2", "the last fifth of each log is kept back, to judge the fit by"))
@@ -259,10 +260,6 @@ def _describe_clock(log: DescribedLog) -> list[tuple[str, str]]:
                 (f"resample = {{ rate_hz = {rate:.10g}, bridge_s = {BRIDGE / rate:.3g} }}", "the clock is irregular")
             )
     return rows
-
-
-def _lasts(log: DescribedLog) -> bool:
-    return log.survey.columns[0].values.size / log.rate_hz >= HOLDOUT_S
 
 
 def _describe_controller(

@@ -5,7 +5,7 @@ Null stands for what is infinite: the value of a requirement that an unstable pl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import field, fields, replace
 from typing import Any
 
@@ -18,8 +18,6 @@ from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.running.fed_back import close_whole, feeds_back, split_states
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import check_schema, check_seal, plain
-from seaopt.parameters import ParameterSet
-from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.bounds.stretch import StretchBound
@@ -39,7 +37,7 @@ from seaopt.robustness.uncertainty.draws import Varied
 from seaopt.robustness.uncertainty.failure_probability import MonteCarlo
 from seaopt.robustness.uncertainty.logs import LogVerdict
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
-from seaopt.robustness.uncertainty.worst import Worst, combine_worst, measure_worst
+from seaopt.robustness.uncertainty.worst import combine_worst, measure_worst
 from seaopt.robustness.verification.impedance_steps import ImpedanceStep
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.limit_cycles import FoundCycle
@@ -237,7 +235,9 @@ def _build_one(
                 if "nu_gap" in content["plants"][name]
             },
             worst={
-                name: _measure_again(controller, plant, parameters, stored.plants[name].worst.cases)
+                name: combine_worst(
+                    [measure_worst(controller, plant, parameters, at) for at in stored.plants[name].worst.cases]
+                )
                 for name, plant in linear.items()
             },
             monte_carlo=stored.monte_carlo,
@@ -305,13 +305,6 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
         **find_port_figures(certificate.controller),
     )
     return replace(certificate, simulated=simulated)
-
-
-def _measure_again(
-    controller: Controller, plant: Plant, nominal: ParameterSet, cases: Sequence[Mapping[str, float]]
-) -> Worst:
-    """Return a worst case from parameters that a file keeps, its loops closed again."""
-    return combine_worst([measure_worst(controller, plant, nominal, at) for at in cases])
 
 
 def read_requirements(content: Mapping[str, Any], source: str = FILE) -> tuple[Requirement, ...]:
