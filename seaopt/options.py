@@ -59,8 +59,8 @@ class Option:
 
 def option(text: str, *, default: Any = MISSING, default_factory: Any = MISSING, **described: Any) -> Any:
     """Return a field of a record that is an option; `described` are fields of `Option`."""
-    given: dict[str, Any] = {"default": default, "default_factory": default_factory}
-    return field(**given, metadata={"option": Option(text=text, **described)})
+    defaults: dict[str, Any] = {"default": default, "default_factory": default_factory}
+    return field(**defaults, metadata={"option": Option(text=text, **described)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

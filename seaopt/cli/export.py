@@ -108,16 +108,16 @@ def export_controller(
     return met
 
 
-def parse_tare(given: str | None) -> Tare | None:
+def parse_tare(text: str | None) -> Tare | None:
     """Return the tare that is typed, as NOISE:LIMIT; None for none."""
-    if given is None:
+    if text is None:
         return None
     try:
-        noise, limit = (float(each) for each in given.split(":"))
+        noise, limit = (float(each) for each in text.split(":"))
         return Tare(noise=noise, limit=limit)
     except (ValueError, ControlError):
         raise ProblemError(
-            f"--tare {given}: is not the std of the force and the largest zero; type such as --tare 2:50"
+            f"--tare {text}: is not the std of the force and the largest zero; type such as --tare 2:50"
         ) from None
 
 

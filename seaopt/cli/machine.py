@@ -153,11 +153,11 @@ def _show(
 def _find_played(folder: Path, stage: str | None, path: Path) -> Played | None:
     """Return how long the reference of a stage is, by the bring-up of a folder; None where it has no such stage."""
     planned = (each["reference"] for each in _list_planned(folder, path) if each["name"] == (stage or FULL))
-    found = next(planned, None)
-    if found is None:
+    plan = next(planned, None)
+    if plan is None:
         return None
-    periods = found["periods"] * found["phases"] + 2  # one that fades in, and one that fades out
-    return Played(period_s=found["period_s"], lasts_s=periods * found["period_s"])
+    periods = plan["periods"] * plan["phases"] + 2  # one that fades in, and one that fades out
+    return Played(period_s=plan["period_s"], lasts_s=periods * plan["period_s"])
 
 
 def _list_planned(folder: Path, path: Path) -> list[dict[str, Any]]:

@@ -338,12 +338,12 @@ class Session:
         experiments, start = self.experiments(), self._find_earlier_fit()
         result = fit_problem(self.problem, experiments, start=start, keep=self._keep_fit, progress=fitting)
         if self.explain:
-            found = find_explanation(result)
-            if found is None:
+            trial = find_explanation(result)
+            if trial is None:
                 self.say(say_unexplained(result.hypotheses))
             else:
                 self._keep_fit(result)
-                result = self._explain(found, result, again)
+                result = self._explain(trial, result, again)
         self.results["scores"] = self._keep_fit(result)
 
     def _find_earlier_fit(self) -> Fit | None:
@@ -372,15 +372,15 @@ class Session:
         self._write("fit", result.to_dict() | {"validation": {score.name: score.to_dict() for score in scores}})
         return scores
 
-    def _explain(self, found: HypothesisTrial, before: Fit, tell: Progress) -> Fit:
+    def _explain(self, trial: HypothesisTrial, before: Fit, tell: Progress) -> Fit:
         """Return the fit of the problem with what explains its logs, which is the problem from here on."""
-        self.problem, lines = adopt(self.problem, found)
+        self.problem, lines = adopt(self.problem, trial)
         self._experiments = None
         path = self.folder / EXPLAINED
         write_text(path, lines + "\n")
         self.written.append(path)
         self.say(
-            f"{say_adopted(found)}; fitting again with the lines in {path}, which belong into {self.problem.source}"
+            f"{say_adopted(trial)}; fitting again with the lines in {path}, which belong into {self.problem.source}"
         )
         result = fit_problem(self.problem, self.experiments(), keep=self._keep_fit, progress=tell)
         return replace(result, hypotheses=(*before.hypotheses, *result.hypotheses))

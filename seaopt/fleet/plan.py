@@ -98,5 +98,5 @@ def name_correlation(first: str, second: str) -> str:
     return ":".join(sorted((first, second))) + "_corr"  # no parameter's name has a colon
 
 
-def _is_free(given: Any) -> bool:
-    return isinstance(given, UnknownTable) and (given.free if given.free is not None else given.prior_std is not None)
+def _is_free(entry: Any) -> bool:
+    return isinstance(entry, UnknownTable) and (entry.free if entry.free is not None else entry.prior_std is not None)

@@ -55,9 +55,9 @@ def make_parameters(table: ProblemTable, plants: Mapping[str, Plant]) -> Paramet
             if name.lower().replace("_", "") == "ke":
                 remedy = "a back-EMF constant in V s/rad is the torque constant in N m/A: give K_tau alone"
             raise ProblemError(f'parameters: unknown parameter "{name}"; {remedy}')
-        given = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
+        entry = value if isinstance(value, ParameterTable) else ParameterTable(value=value)
         try:
-            parameters[name] = make_parameter(parameters[name], given)
+            parameters[name] = make_parameter(parameters[name], entry)
         except UnitError as error:
             raise UnitError(f"parameters.{name}: {error}") from error
     return ParameterSet(parameters.values())

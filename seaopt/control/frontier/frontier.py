@@ -125,9 +125,9 @@ def sweep(
             outer=outer,
             free_law=free_law,
         )
-        found = sweep_schedule(schedules, specs, executor, progress)
-        progress(f"{spec.structure} over {over}, {len(found)} bandwidths", 1.0)
-        return Frontier(rows=tuple(row for row, _ in found), controllers=tuple(law for _, law in found), over=over)
+        pairs = sweep_schedule(schedules, specs, executor, progress)
+        progress(f"{spec.structure} over {over}, {len(pairs)} bandwidths", 1.0)
+        return Frontier(rows=tuple(row for row, _ in pairs), controllers=tuple(law for _, law in pairs), over=over)
     sliding, sliding_robust_to = slide_plants(plant, params, robust_to)
     swept = _SweepTask(
         task=make_task(plant, params, specs[0], robust_to, draws),

@@ -107,12 +107,12 @@ def sweep_schedule(
     parts = divide(progress, *(1.0 for _ in specs))
     if executor is None:
         return [_tune_row(swept, spec, part) for spec, part in zip(specs, parts, strict=True)]
-    found: list[tuple[FrontierRow, ScheduledController]] = []
+    pairs: list[tuple[FrontierRow, ScheduledController]] = []
     done = map_ordered(partial(_tune_part, Shared(swept)), specs, executor)
     for spec, part, row_and_law in zip(specs, parts, done, strict=True):
         part(f"{spec.bandwidth_hz:g} Hz", 1.0)
-        found.append(row_and_law)
-    return found
+        pairs.append(row_and_law)
+    return pairs
 
 
 def _tune_part(swept: Shared[ScheduleSweep], spec: ControllerSpec) -> tuple[FrontierRow, ScheduledController]:
@@ -127,10 +127,10 @@ def _tune_row(
     schedule, alone = swept.tune(spec, whole), None
     if swept.sticks:
         sliding = swept.slide()
-        found = sliding.tune(spec, part)
-        places = sliding.measure(found)
+        tuned = sliding.tune(spec, part)
+        places = sliding.measure(tuned)
         alone = SlidingAlone(
-            met=found.met,
+            met=tuned.met,
             noise_gain=max(row.noise_gain for row in places),
             disturbance=max(row.disturbance for row in places),
         )

@@ -259,11 +259,11 @@ def _weigh(
     look = ca.Function("look", [plant.t, plant.x, plant.u, plant.p], [both])
     p, rng, sizes = plant.complete(params).vector, np.random.default_rng(1), (len(plant.states), len(plant.inputs))
     rows = [look(0.0, *(rng.normal(size=size) for size in sizes), p).full().ravel() for _ in range(PLACES)]
-    effort, told = np.array(rows)[:, 0], np.array(rows)[:, 1:]
-    found = np.linalg.lstsq(told, effort, rcond=None)[0]
-    weights, damping = np.split(found, 2)
+    effort, readings = np.array(rows)[:, 0], np.array(rows)[:, 1:]
+    solution = np.linalg.lstsq(readings, effort, rcond=None)[0]
+    weights, damping = np.split(solution, 2)
     lag = float(damping @ weights / (weights @ weights)) if np.any(weights) else math.nan
-    error = np.max(np.abs(told @ np.concatenate([weights, lag * weights]) - effort))
+    error = np.max(np.abs(readings @ np.concatenate([weights, lag * weights]) - effort))
     if not error <= LINEAR * np.max(np.abs(effort)):
         raise ControlError(
             f"agreement: {regulated} of {plant.name} is no fixed multiple of {join_words(names)}: the spring is not "

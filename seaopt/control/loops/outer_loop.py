@@ -146,20 +146,20 @@ class OuterLoop:
         """The force that it asks for by a unit of what it is given: of x_0, or without a stiffness of a force."""
         return self.direction * self.stiffness or 1.0
 
-    def split(self, given: Any) -> tuple[Any, Any]:
+    def split(self, reference: Any) -> tuple[Any, Any]:
         """Return x_0, and the force that is asked for besides, of what the law that runs is given. Without a stiffness
         no x_0 does anything, and what is given is that force.
         """
-        return (given, 0.0) if self.stiffness else (0.0, given)
+        return (reference, 0.0) if self.stiffness else (0.0, reference)
 
     @property
     def numbers(self) -> list[float]:
         """Its numbers, as `follow_link` takes them."""
         return [self.direction * self.stiffness, self.direction * self.damping, self.pole, self.rate]
 
-    def ask(self, given: Any, positions: Any) -> Float[np.ndarray, "... n"]:
+    def ask(self, references: Any, positions: Any) -> Float[np.ndarray, "... n"]:
         """Return the references of the force law that runs, over samples as `run`, of what that law is given."""
-        position, force = self.split(given)
+        position, force = self.split(references)
         return self.run(position, positions) + force
 
     def run(self, references: Any, positions: Any) -> Float[np.ndarray, "... n"]:

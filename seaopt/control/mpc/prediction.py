@@ -147,8 +147,8 @@ def find_plan_bandwidth(
         raise ControlError(
             f"bandwidth_hz = {bandwidth_hz:g}: no plan has it behind the prefilter; raise its corner, or ask for less"
         )
-    found: Any = brentq(excess, bandwidth_hz, fastest, xtol=1e-6 * bandwidth_hz)
-    return float(found)
+    root: Any = brentq(excess, bandwidth_hz, fastest, xtol=1e-6 * bandwidth_hz)
+    return float(root)
 
 
 def condense(

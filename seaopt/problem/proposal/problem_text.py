@@ -128,13 +128,13 @@ def _offer_stribeck(lines: Sequence[ParameterLine]) -> list[str]:
 
 def _describe_delay(log: DescribedLog, logs: Sequence[DescribedLog]) -> str:
     """Return the line of a log's delay: fitted where the log, or another of this drive, shows one, else a remark."""
-    found = _find_delayed(log, logs)
-    delay = None if found is None else found.traits.delay_s
-    if found is None or delay is None:
+    delayed = _find_delayed(log, logs)
+    delay = None if delayed is None else delayed.traits.delay_s
+    if delayed is None or delay is None:
         return "# delay_s = { value = 0.002, free = true, max = 0.02 }  # if the input takes effect late"
     text = f"delay_s = {{ value = {delay:.2g}, free = true, max = {max(4.0 * delay, 0.02):.2g} }}"
     why = "the outputs respond late, by their phase"
-    return _comment(text, why if found is log else f"{found.survey.name} shows it, and the drive is the same")
+    return _comment(text, why if delayed is log else f"{delayed.survey.name} shows it, and the drive is the same")
 
 
 def _find_delayed(log: DescribedLog, logs: Sequence[DescribedLog]) -> DescribedLog | None:

@@ -195,7 +195,7 @@ def _assign(survey: LogSurvey, interview: Interview, turns: bool, stated: Stated
         return _check_outputs(roles, survey)
     assigned = {column.name: role for role, column in roles.columns.items()}
     choices = (*INPUTS, *(ROTARY_OUTPUTS if turns else LINEAR_OUTPUTS), "none")
-    given = {
+    answered = {
         column.name: stated.roles.get(column.name)
         or interview.ask(
             f"role:{column.name}",
@@ -206,10 +206,10 @@ def _assign(survey: LogSurvey, interview: Interview, turns: bool, stated: Stated
         )
         for column in survey.columns
     }
-    chosen = [role for role in given.values() if role in INPUTS]
+    chosen = [role for role in answered.values() if role in INPUTS]
     if len(chosen) != 1:
         raise ProblemError(f"{survey.name}: {len(chosen)} columns are inputs; give exactly one of {', '.join(INPUTS)}")
-    answers = {name: "" if role == "none" else role for name, role in given.items()}
+    answers = {name: "" if role == "none" else role for name, role in answered.items()}
     return _check_outputs(assign(survey, rotary=turns, given=answers), survey)
 
 

@@ -124,8 +124,8 @@ class Interview:
 
     def list_doubts(self) -> dict[str, str]:
         """Return why answers are doubted, by the keys of their questions."""
-        given = {question.key: question for question in self.questions if question.key in self.answers}
-        doubts = {key: question.doubt(question.read(self.answers[key])) for key, question in given.items()}
+        answered = {question.key: question for question in self.questions if question.key in self.answers}
+        doubts = {key: question.doubt(question.read(self.answers[key])) for key, question in answered.items()}
         return {key: doubt for key, doubt in doubts.items() if doubt}
 
     def list_guessed(self) -> list[str]:

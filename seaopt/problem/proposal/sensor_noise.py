@@ -31,14 +31,14 @@ class SensorNoise:
 
 def measure_noise(logs: Sequence[DescribedLog], output: str) -> SensorNoise:
     """Return an output's noise from sample to sample, of the log that has most of it; none where no log has it."""
-    found = [SensorNoise()]
+    candidates = [SensorNoise()]
     for log in logs:
         if output in log.roles.columns:
             column, scale = log.roles.columns[output], abs(log.si_scale(output))
             seen, step = column.noise * scale, column.quantum * scale
             rounded = step if step > COARSE * seen else 0.0
-            found.append(SensorNoise(std=math.sqrt(max(seen**2 - rounded**2 / 12.0, 0.0)), step=rounded))
-    return max(found, key=lambda noise: noise.total)
+            candidates.append(SensorNoise(std=math.sqrt(max(seen**2 - rounded**2 / 12.0, 0.0)), step=rounded))
+    return max(candidates, key=lambda noise: noise.total)
 
 
 def list_sensors(logs: Sequence[DescribedLog], actuator: Proposed) -> dict[str, SensorNoise]:

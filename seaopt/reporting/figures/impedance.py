@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def region_panel(region: ImpedanceRegion, asked: Impedance | None = None) -> Panel:
+def region_panel(region: ImpedanceRegion, specified: Impedance | None = None) -> Panel:
     """Draw where stiffness and damping at the link are passive, where the link alone is stable, and what is asked."""
 
     def draw(axis: Axes) -> None:
@@ -30,7 +30,7 @@ def region_panel(region: ImpedanceRegion, asked: Impedance | None = None) -> Pan
             axis.plot(region.critical.damping, region.critical.stiffness, color=GREEN, linewidth=1.3, label="critical")
         if region.spring is not None and region.spring <= region.stiffness[-1]:
             draw_level(axis, region.spring, "the spring", style=":")
-        for impedance, marker, label in ((region.stiffest, "^", "stiffest"), (asked, "D", "asked")):
+        for impedance, marker, label in ((region.stiffest, "^", "stiffest"), (specified, "D", "asked")):
             if impedance is not None:
                 point = [impedance.damping], [impedance.stiffness]
                 axis.plot(*point, marker, color=LIMIT, markersize=6, label=label)

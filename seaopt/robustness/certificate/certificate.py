@@ -395,11 +395,11 @@ class Certificate(Result, Worded):
         yield from (self.proof, self.assumption)
         yield from (f"{name}: {describe_sweeps(sweeps, unit)}" for name, sweeps in self.sweeps.items())
         yield from (f"{name}: {describe_motion(motion, over, unit)}" for name, motion in self.motions.items())
-        said = dict(zip(self.values, (certificate.notes for certificate in self.places), strict=True))
-        shared = [note for note in next(iter(said.values())) if all(note in notes for notes in said.values())]
+        notes_at = dict(zip(self.values, (certificate.notes for certificate in self.places), strict=True))
+        shared = [note for note in next(iter(notes_at.values())) if all(note in notes for notes in notes_at.values())]
         yield from shared
         for value in schedule.points:
-            yield from (f"{over} = {value:g}: {note}" for note in said[value] if note not in shared)
+            yield from (f"{over} = {value:g}: {note}" for note in notes_at[value] if note not in shared)
 
     def _list_notes(self) -> Iterator[str]:
         if self.controller.structure == CUSTOM and self.constrained is None:
@@ -499,12 +499,12 @@ def _take_worst(
     return worst
 
 
-def _rank_friction(found: Mapping[str, Any]) -> tuple[bool, float]:
+def _rank_friction(entry: Mapping[str, Any]) -> tuple[bool, float]:
     """Return how bad a place's friction is: first whether it is not shown to be harmless, then the least
     slope that is, at the nominal parameters and at draws.
     """
-    drawn = found.get("draws")
+    drawn = entry.get("draws")
     slopes = [] if drawn is None else [drawn["least_slope"]]
-    if "slopes" in found:  # as `FrictionMargin.least_slope`
-        slopes.append(min((slope for slope in found["slopes"] if slope > 0.0), default=0.0))
-    return not found["sector_stable"], -min(slopes, default=np.inf)
+    if "slopes" in entry:  # as `FrictionMargin.least_slope`
+        slopes.append(min((slope for slope in entry["slopes"] if slope > 0.0), default=0.0))
+    return not entry["sector_stable"], -min(slopes, default=np.inf)

@@ -265,11 +265,13 @@ def compensation_requirements(
     rows: list[Requirement] = []
     for name, margin in margins.items():
         drawn, value, draw = draws.get(name), margin.slope, None
-        said = [f"{margin.multiplier}; {margin.shift} at {margin.frequency_hz:.4g} Hz" if value else margin.multiplier]
+        reasons = [
+            f"{margin.multiplier}; {margin.shift} at {margin.frequency_hz:.4g} Hz" if value else margin.multiplier
+        ]
         if drawn is not None and drawn.least_slope < value:
-            value, draw, said = drawn.least_slope, DrawnAt(parameters=drawn.parameters), []
+            value, draw, reasons = drawn.least_slope, DrawnAt(parameters=drawn.parameters), []
         if friction is not None and value:
-            said.append(f"shown up to {value / margin.required * friction.fraction:.3g} of the friction")
+            reasons.append(f"shown up to {value / margin.required * friction.fraction:.3g} of the friction")
         rows.append(
             require_at_least(
                 FRICTION_COMPENSATION,
@@ -278,7 +280,7 @@ def compensation_requirements(
                 unit=controller.command.mechanics.damping,
                 plant=name,
                 draw=draw,
-                text="; ".join(said),
+                text="; ".join(reasons),
             )
         )
     return rows

@@ -142,8 +142,8 @@ def judge_logs(context: CheckContext, _: Progress) -> Evidence:
     logs = [each for each in (*fit.experiments, *fit.validation) if each.plant.name in names]
     if context.place is not None:
         logs = [each for each in logs if np.isclose(_find_log_place(context.place[0], fit, each), context.place[1])]
-    found = [judge_log(controller, fit, experiment, limit) for experiment in logs]
-    verdicts = tuple(verdict for of_log, _ in found for verdict in of_log)
+    judged = [judge_log(controller, fit, experiment, limit) for experiment in logs]
+    verdicts = tuple(verdict for of_log, _ in judged for verdict in of_log)
     rows = (
         require_at_most(
             LOG_SENSITIVITY,
@@ -155,7 +155,7 @@ def judge_logs(context: CheckContext, _: Progress) -> Evidence:
         )
         for each in verdicts
     )
-    remarks = [SILENT[silent.why].format(silent) for _, silent in found if silent is not None]
+    remarks = [SILENT[silent.why].format(silent) for _, silent in judged if silent is not None]
     if fit.experiments and not logs and context.place is None:
         remarks.append(NO_LOG)
     return Evidence(requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remarks), scope="measured")

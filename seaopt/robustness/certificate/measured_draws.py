@@ -192,8 +192,8 @@ def judge_draws(
         parts = (distinct[k : k + DRAWS_PER_PART] for k in range(0, len(distinct), DRAWS_PER_PART))
         judged = map_ordered(partial(judge, context.shared, name), parts, context.executor)
         cases = zip(distinct, (case for part in judged for case in part), strict=True)
-        found = {tuple(draw.items()): case for draw, case in cases}
-        made[name] = [(draw, found[tuple(draw.items())]) for draw in of_plant]
+        by_draw = {tuple(draw.items()): case for draw, case in cases}
+        made[name] = [(draw, by_draw[tuple(draw.items())]) for draw in of_plant]
     return made
 
 
@@ -204,7 +204,7 @@ def draw_requirements(
     bound = _require_bound(result, max_failure_probability)
     if not result.samples:
         return bound
-    spot, case = max(worst.items(), key=lambda found: found[1].severity)
+    spot, case = max(worst.items(), key=lambda entry: entry[1].severity)
     size = f"has Ms {case.witness.ms:.4g}, Mt {case.witness.mt:.4g}" if case.severity < UNSTABLE else "is UNSTABLE"
     rows = [
         require_at_most(

@@ -178,13 +178,13 @@ def build_certificate(
         return _build_one(read_certificate(content), content, cases, None)
     check_file(content, of_schedule=True)
     stored = from_content(StoredScheduleCertificate, content, FILE, remedy=CERTIFY_AGAIN)
-    found = stored.schedule
-    if len(found.places) != len(posed):
-        raise FileError(f"{FILE}: has {len(found.places)} places, and the schedule {len(posed)}; {CERTIFY_AGAIN}")
+    of_schedule = stored.schedule
+    if len(of_schedule.places) != len(posed):
+        raise FileError(f"{FILE}: has {len(of_schedule.places)} places, and the schedule {len(posed)}; {CERTIFY_AGAIN}")
     places = tuple(
         _build_one(stored_at, written, cases, (law.over, value))
         for stored_at, written, (value, cases) in zip(
-            found.places, content["schedule"]["places"], posed.items(), strict=True
+            of_schedule.places, content["schedule"]["places"], posed.items(), strict=True
         )
         if value is not None
     )
@@ -197,9 +197,9 @@ def build_certificate(
         varied=places[-1].varied,
         schedule=law,
         places=places,
-        stretches=found.stretches,
-        sweeps=found.sweeps,
-        motions=found.motions,
+        stretches=of_schedule.stretches,
+        sweeps=of_schedule.sweeps,
+        motions=of_schedule.motions,
         remarks=stored.remarks,
         **take_worst(places),
     )
@@ -269,10 +269,10 @@ def _build_one(
 def _check_current(name: str, written: Mapping[str, Any], figures: LoopFigures) -> None:
     """Refuse a plant whose Ms or Mt in a file is of another loop than that with what the law feeds back besides."""
     for key in ("ms", "mt"):
-        value, found = written.get(key), getattr(figures, key)
-        if not np.isclose(np.inf if value is None else value, found, rtol=SAME_FIGURES, atol=0.0):
+        value, figure = written.get(key), getattr(figures, key)
+        if not np.isclose(np.inf if value is None else value, figure, rtol=SAME_FIGURES, atol=0.0):
             raise FileError(
-                f"{FILE}: {key} of {name} is {value}, and {found:.4g} with what the law's compensation and outer loop "
+                f"{FILE}: {key} of {name} is {value}, and {figure:.4g} with what the law's compensation and outer loop "
                 f"feed back: it is of an older seaopt, or of another law; {CERTIFY_AGAIN}"
             )
 

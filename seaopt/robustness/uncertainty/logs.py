@@ -129,11 +129,11 @@ def judge_log(
         runs = whole.runs
         if find_feedback(whole.command, whole.error, runs):
             return (), silent(why="looks like feedback")
-        found = [_judge(controller, fit.parameters, part, part.runs, ms * (1.0 + GRACE)) for part in parts]
+        judged = [_judge(controller, fit.parameters, part, part.runs, ms * (1.0 + GRACE)) for part in parts]
         first = _judge(controller, fit.parameters, whole, runs, ms * (1.0 + GRACE))
     except SeaoptError as error:
         return (), silent(why="an error", detail=str(error))
-    verdicts = tuple(verdict for verdict in (first, *found) if verdict is not None)
+    verdicts = tuple(verdict for verdict in (first, *judged) if verdict is not None)
     return verdicts, silent(why="too weak") if first is None else None
 
 
@@ -249,17 +249,17 @@ def _tell(
         loop = np.sum(c * _find_base(controller, params, part, f), axis=0)
     radius = std * response.widen(alpha) + unseen
     size = np.maximum(np.abs(1.0 + loop), np.abs(1.0 + loop + error))
-    told = median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC
+    usable = median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC
     if part.dry:  # what transients and friction make of the model's own response is no loop gain
         rough = np.sum(np.abs(c) * np.sqrt(response.rough), axis=0) * response.widen(CONFIRM)
-        told &= median_filter(rough / size, SMOOTH, mode="nearest") < LARGEST_DISC
-    if np.count_nonzero(told) < FEWEST_LINES:
+        usable &= median_filter(rough / size, SMOOTH, mode="nearest") < LARGEST_DISC
+    if np.count_nonzero(usable) < FEWEST_LINES:
         return None
-    first, last = np.flatnonzero(told)[[0, -1]]
-    lines = (x[told] for x in (f, loop, error, std, unseen, radius))
+    first, last = np.flatnonzero(usable)[[0, -1]]
+    lines = (x[usable] for x in (f, loop, error, std, unseen, radius))
     names = ("f", "loop", "error", "std", "unseen", "radius")
     return _WindowLines(
-        **dict(zip(names, lines, strict=True)), freedom=response.freedom, gapless=bool(np.all(told[first:last]))
+        **dict(zip(names, lines, strict=True)), freedom=response.freedom, gapless=bool(np.all(usable[first:last]))
     )
 
 
@@ -269,8 +269,8 @@ def _judge(
     """Return what a record says of a law; None where it says nothing."""
     responses = _measure(controller, part, runs)
     alpha = REFUTE / max(sum(response.frequency_hz.size for response in responses), 1)
-    told = [_tell(controller, params, part, response, alpha) for response in responses]
-    kinds = [lines for lines in told if lines is not None]
+    readable = [_tell(controller, params, part, response, alpha) for response in responses]
+    kinds = [lines for lines in readable if lines is not None]
     if not kinds:
         return None
     surest = max(kinds, key=lambda lines: _bound_ms(lines, limit)[0])

@@ -269,17 +269,17 @@ class RestStart:
         named = {self.schedule.over: value} | self.readings
         further = [named.get(name, 0.0) for name in law.further]
         reference = float(fed[0]) - _weigh(law, named, value)
-        given = reference + references
+        played = reference + references
         if law.outer is not None:
             x_0, _ = law.outer.split(self.readings.get(law.outer.position, 0.0))
             travelled, _ = law.outer.split(_travel(plant, law.outer, values, references.shape[1]))
             reference = reference / law.outer.per_given + x_0
-            given = reference + references / law.outer.per_given + travelled
+            played = reference + references / law.outer.per_given + travelled
         kept = list_kept(law, law.reset(reference, fed, value, self.command, readings=further))
         x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]
         count = len(references)
         start = LoopState(x=np.tile(x, (count, 1)), z=np.tile(z, (count, 1)))
-        run = run_loop(loop, [values] * count, given, start=start, places=places)
+        run = run_loop(loop, [values] * count, played, start=start, places=places)
         if not all(np.all(np.isfinite(rows)) for rows in (*run.outputs.values(), run.current)):
             raise SimulationError("it runs away")
         if np.any(find_faults(law, run.end.z)):

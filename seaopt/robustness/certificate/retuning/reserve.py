@@ -115,13 +115,13 @@ def look_at_draws(
 def _look_at_plant(posed: Sequence[Cases], tuned: Sequence[Cases], name: str, points: Points) -> Look:
     """Return the worst case of a plant at all values, those at which the law was `tuned` among them."""
     most = np.array([np.max(_rank(cases, name, cases.unknown.values(points))) for cases in posed])
-    found: dict[int, Worst] = {}
-    while len(found) < SEARCHES and (at := int(np.argmax(most))) not in found:
+    searched: dict[int, Worst] = {}
+    while len(searched) < SEARCHES and (at := int(np.argmax(most))) not in searched:
         cases = posed[at]
-        found[at] = find_worst(cases.controller, cases.plants[name], cases.unknown, points)
-        most = np.maximum(most, [_rank_one(each, name, found[at]) for each in posed])
-        most[at] = found[at].severity
-    worst = max(found.values(), key=lambda case: case.severity)
+        searched[at] = find_worst(cases.controller, cases.plants[name], cases.unknown, points)
+        most = np.maximum(most, [_rank_one(each, name, searched[at]) for each in posed])
+        most[at] = searched[at].severity
+    worst = max(searched.values(), key=lambda case: case.severity)
     alone = (replace(each, controller=_strip(each.controller)) for each in tuned)
     return Look(worst=worst, alone=max(_rank_one(each, name, worst) for each in alone))
 
