@@ -174,7 +174,7 @@ def run_loop(
     n = wanted.shape[1]
     noise = _noise(loop, values, n, seed, standing)
     if isinstance(loop.law, RunnableSchedule):
-        noise = np.dstack([noise, np.broadcast_to(0.0 if loop.over in loop.plant.states else places, (runs, n))])
+        noise = np.dstack([noise, np.broadcast_to(0.0 if loop.place in loop.plant.states else places, (runs, n))])
     job = Job(
         reference=np.ascontiguousarray(np.broadcast_to(wanted, (runs, n))),
         noise=noise,

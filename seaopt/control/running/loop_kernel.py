@@ -126,7 +126,7 @@ def _structure_of(loop: SampledLoop, job: Job) -> _Structure:
         devices=tuple(_describe_device(sensors, name)[0] for name in names),
         encoders=tuple((encoder, _describe_device(sensors, encoder)[0]) for encoder in loop.encoders),
         sticks=loop.sticks,
-        over=loop.over if loop.over in loop.plant.states else None,
+        over=loop.place if loop.place in loop.plant.states else None,
     )
 
 

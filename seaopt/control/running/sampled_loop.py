@@ -53,7 +53,7 @@ class SampledLoop:
         smoothed curve.
     link : str, optional
         Of what is measured the link's motion: a plant without that output holds this link, which stands still there.
-    over : str, optional
+    place : str, optional
         The scheduling variable of a schedule: a state of the plant, which the law is given as it is; else `run_loop`
         is told where it stands.
 
@@ -72,7 +72,7 @@ class SampledLoop:
     longest_delay_s: float = 0.0
     sticks: bool = False
     link: str | None = None
-    over: str | None = None
+    place: str | None = None
 
     def __post_init__(self) -> None:
         plant = self.plant

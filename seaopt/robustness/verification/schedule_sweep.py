@@ -265,7 +265,7 @@ class RestStart:
                 f"{needed} holds it at {self.schedule.over} = {self.value:.4g}, above the limit of {limit}"
             )
         fed = np.array([self.readings[name] for name in self.schedule.controllers[0].signals])
-        loop = build_loop(self.schedule.controllers[0], plant, [values], law, over=self.schedule.over)
+        loop = build_loop(self.schedule.controllers[0], plant, [values], law, place=self.schedule.over)
         named = {self.schedule.over: value} | self.readings
         further = [named.get(name, 0.0) for name in law.further]
         reference = float(fed[0]) - _weigh(law, named, value)

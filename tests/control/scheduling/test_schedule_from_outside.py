@@ -150,7 +150,7 @@ def test_the_swinging_knee_is_where_an_own_simulation_has_it(schedule, swung):
     _, swing, values = read_knee()
     x, torque, current = rest_knee(0.3)
     law = schedule.runnable()
-    loop = SampledLoop(plant=swing, law=law, measured="tau", delay_samples=1, over="phi")
+    loop = SampledLoop(plant=swing, law=law, measured="tau", delay_samples=1, place="phi")
     kept = list_kept(law, law.reset(torque, torque, 0.3, current))
     start = LoopState(x=np.array([x]), z=np.array([[*kept, current]]))
     run = run_loop(loop, [values], references, start=start, rtol=1e-8)
