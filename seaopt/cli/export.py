@@ -108,16 +108,16 @@ def export_controller(
     return met
 
 
-def parse_tare(text: str | None) -> Tare | None:
+def parse_tare(stated: str | None) -> Tare | None:
     """Return the tare that is typed, as NOISE:LIMIT; None for none."""
-    if text is None:
+    if stated is None:
         return None
     try:
-        noise, limit = (float(each) for each in text.split(":"))
+        noise, limit = (float(each) for each in stated.split(":"))
         return Tare(noise=noise, limit=limit)
     except (ValueError, ControlError):
         raise ProblemError(
-            f"--tare {text}: is not the std of the force and the largest zero; type such as --tare 2:50"
+            f"--tare {stated}: is not the std of the force and the largest zero; type such as --tare 2:50"
         ) from None
 
 
