@@ -119,7 +119,7 @@ def test_a_loop_with_more_delay_than_it_stands_diverges_or_does_not_settle(mpc, 
 
 def test_of_a_loop_that_rings_a_lower_bandwidth_is_asked_for(stand, thor, monkeypatch):
     """With nothing asked of where the force settles, as of a link that moves."""
-    monkeypatch.setattr(constrained._Case, "_judge_force", lambda *_: None)
+    monkeypatch.setattr(constrained._PlantRun, "_judge_force", lambda *_: None)
     mpc = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=20.0))
     late = so.certify(mpc, {"stand": stand}, thor, ranges={"delay_s": (6.5e-3, 6.6e-3)}, samples=1, runs=1).constrained
     assert late.ringing == 1 and late.remedy.startswith("a lower bandwidth_hz, or narrower ranges of delay_s")
