@@ -45,6 +45,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.records import record
+from seaopt.welch import square
 
 ALIASES = 30  # on either side; what is beyond is bounded
 ORDERS = np.arange(-ALIASES, ALIASES + 1)
@@ -241,7 +242,7 @@ def _form_terms_of_one(at: LoopResponses, weight: AtAliases) -> TermsOf:
     """Return `_form_terms` where there is one friction: numbers, not matrices, and most of them for every 1/kappa."""
     mobility, slope = np.real(weight * at.mobility[..., 0, 0]), np.real(weight)
     command, sensed = weight * at.command[..., 0], at.sensed[..., 0]
-    commanded, sensing, crossed = _square(command), _square(sensed), np.conj(sensed) * command
+    commanded, sensing, crossed = square(command), square(sensed), np.conj(sensed) * command
 
     def form(inverse: float, angles: Places) -> Terms:
         real = mobility[angles] + inverse * slope[angles]
@@ -249,10 +250,6 @@ def _form_terms_of_one(at: LoopResponses, weight: AtAliases) -> TermsOf:
         return np.min(real, axis=-1) > 0.0, commanded[angles] * share, sensing[angles] * share, crossed[angles] * share
 
     return form
-
-
-def _square(values: AtAliases) -> Float[np.ndarray, "m k"]:
-    return np.real(values) ** 2 + np.imag(values) ** 2
 
 
 def _compare(at: LoopResponses, angles: Places, alpha: RealTerms, beta: RealTerms, gamma: ComplexTerms) -> Angles:

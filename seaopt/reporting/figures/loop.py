@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from seaopt.control import Controller, Loop
-from seaopt.control.loops.loop import STABLE
 from seaopt.control.running.fed_back import close_whole
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
@@ -67,7 +66,7 @@ def step_panel(
     loops, period = close_loops(controller, plants), controller.sample_time_s
     if duration_s is None:
         first = next(iter(loops.values()))
-        settled = _settle(first.simulate(np.ones(round(MOST_S / period)))[0]) * period if _is_stable(first) else 0.0
+        settled = _settle(first.simulate(np.ones(round(MOST_S / period)))[0]) * period if first.is_stable() else 0.0
         duration_s = min(max(LEAST_PERIODS / controller.spec.bandwidth_hz, SPARE * settled), MOST_S)
     samples = max(round(duration_s / period), 2)
     command, measured = controller.command, controller.spec.regulated
@@ -77,7 +76,7 @@ def step_panel(
         upper.plot([0.0, time[-1]], [size, size], color=LIMIT, linestyle=":", linewidth=1.0, label="reference")
         for loop, look in _style_loops(loops):
             force, effort = loop.simulate(np.full(samples, size))
-            if not _is_stable(loop):
+            if not loop.is_stable():
                 look["label"] += " (unstable)"
                 gone = np.flatnonzero(np.abs(force) > RUNAWAY * abs(size))
                 force[gone[0] if gone.size else samples :] = np.nan
@@ -97,10 +96,6 @@ def step_panel(
         caption=f"{measured} and the {command.word} after a step of the reference by {size:g}{unit}: the linear loop, "
         "sampled, without limit and noise.",
     )
-
-
-def _is_stable(loop: Loop) -> bool:
-    return bool(np.max(np.abs(loop.eigenvalues()), initial=0.0) < STABLE)
 
 
 def _settle(force: VectorN) -> int:
