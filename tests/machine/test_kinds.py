@@ -23,7 +23,7 @@ from seaopt.control.running.law_step import run_law
 from seaopt.formatting import format_number
 from seaopt.machine.design_run import run_design
 from seaopt.machine.gains.free_gains import read_gains
-from seaopt.machine.stepped import Setting
+from seaopt.machine.stepped import Setting, limit_law
 from seaopt.machine.ticks import Ticks
 from seaopt.machine.wording import say_cause
 from tests.machine.simulator import Bench, Machine, multisine
@@ -138,19 +138,26 @@ def test_where_a_schedule_stood_is_said_or_asked_for(schedule, scheduled):
         so.accept(schedule.at(6e5), [bare], at=6e5)
 
 
-def test_a_law_steps_over_a_log_as_by_itself(schedule):
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("limited", [True, False])
+def test_a_law_steps_over_a_log_as_by_itself(monkeypatch, schedule, compiled, limited):
+    if not compiled:
+        monkeypatch.setattr("seaopt.control.running.law_step._load_kernel", lambda _: None)
     rng, n = np.random.default_rng(1), 700
     r, y = (2000.0 * rng.normal(size=n) for _ in range(2))
-    law, place = schedule.runnable(), 6e5
+    limit, place = 9.0 if limited else np.inf, 6e5
+    law = limit_law(schedule.runnable(), limit)
     commands = run_law(law, r, y[:, None], np.zeros((n, 0)), np.full(n, place), law.reset(place=place))
     state, expected = law.reset(place=place), np.empty(n)
     for k in range(n):
         expected[k], state = law.step(state, r[k], y[k], place)
-    np.testing.assert_allclose(commands, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(commands, expected, rtol=0.0 if limited else 1e-12, atol=1e-12)
     frozen = law.freeze(place)
     at_rest = LawState(x=np.zeros(frozen.c.size))
     np.testing.assert_allclose(run_law(frozen, r, y[:, None], np.zeros((n, 0)), None, at_rest), expected, atol=1e-11)
-    np.testing.assert_allclose(runnable(schedule.at(place)).run(r, y)[0], expected, atol=1e-11)
+    assert bool(np.max(np.abs(expected)) <= 9.0) is limited
+    alone = runnable(schedule.at(place), command_limit=limit)
+    np.testing.assert_allclose(alone.run(r, y)[0], expected, atol=1e-11)
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, reduce
+from importlib.resources import files
 from operator import add, mul
 from threading import get_ident
 from typing import Any
@@ -27,9 +28,12 @@ from seaopt.control.scheduling.runnable_schedule import RunnableSchedule, Schedu
 from seaopt.plants.motor.heat_guard import HEAT_NUMBERS, limit_current, warm_winding
 from seaopt.records import record
 from seaopt.simulation.direct_call import DirectCall
+from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel
 
 GATE_NUMBERS, OUTER_NUMBERS = 5, 4
-CHUNK = 500  # samples that a law is run over in one call
+CHUNK = 500  # samples that a law is run over in one call of the virtual machine
+_POINTERS = ("c", "r", "y", "w", "place", "kept", "out")
+_ARGUMENTS = np.dtype([("n", np.int64), *((name, np.uint64) for name in _POINTERS)])
 
 
 @record
@@ -70,6 +74,11 @@ class LawShape:
         """The outputs that are read besides what is fed back."""
         positions = (self.position,) if self.position else ()
         return tuple(dict.fromkeys((*self.compensation.reads, *self.encoders, *positions)))
+
+    @property
+    def row_sizes(self) -> tuple[int, ...]:
+        """How many numbers of a sample are given: reference, what is fed back, what is read besides, the place."""
+        return 1, self.measured, len(self.further), int(self.schedule is not None)
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -149,10 +158,35 @@ def run_law(
     """Return the commands of a law over samples whose inputs are numbers, by the step that the compiled loop runs.
     `further`: what its terms read; `places`: of a schedule, its variable.
     """
-    shape = replace(LawShape.of_law(law), holds=law.gate is not None)
-    run, numbers = _chain_steps(shape, get_ident()), np.tile(list_numbers(law), CHUNK)
-    kept, n = list_kept(law, start), references.size
-    signals = (references[:, None], measured, further, np.zeros((n, 0)) if places is None else places[:, None])
+    # Without a limit it is infinite here, and so one kernel less.
+    shape = replace(LawShape.of_law(law), limited=True, holds=law.gate is not None)
+    numbers, kept = list_numbers(law), list_kept(law, start)
+    if not np.isfinite(law.command_limit):
+        numbers[shape.number_sizes[0]] = np.inf
+    signals, out = (references, measured, further, () if places is None else places), np.empty(references.size)
+    rows = [
+        np.ascontiguousarray(signal, dtype=float).reshape(out.size, width)
+        for signal, width in zip(signals, shape.row_sizes, strict=True)
+    ]
+    kernel = _load_kernel(shape)
+    if kernel is None:
+        return _run_interpreted(shape, numbers, kept, rows)
+    arguments = np.zeros(1, dtype=_ARGUMENTS)
+    arguments["n"] = out.size
+    for name, array in zip(_POINTERS, (numbers, *rows, kept, out), strict=True):
+        arguments[name] = array.ctypes.data
+    kernel.run(arguments, (numbers, rows, kept, out), parallel=False)
+    return out
+
+
+def _run_interpreted(
+    shape: LawShape,
+    numbers: Float[np.ndarray, " m"],
+    kept: Float[np.ndarray, " k"],
+    signals: Sequence[Float[np.ndarray, "n _"]],
+) -> Float[np.ndarray, " n"]:
+    """Run in CasADi's virtual machine."""
+    run, numbers, n = _chain_steps(shape, get_ident()), np.tile(numbers, CHUNK), len(signals[0])
     out = np.empty(n)
     for first in range(0, n, CHUNK):
         at = np.minimum(np.arange(first, first + CHUNK), n - 1)  # the last chunk is filled up
@@ -165,12 +199,26 @@ def run_law(
 @lru_cache(maxsize=16)
 def _chain_steps(shape: LawShape, _thread: int) -> DirectCall:
     """Return the steps of a chunk in a row, which a thread has to itself: what is kept after each, and the commands."""
+    return DirectCall(_step_function(shape).mapaccum(CHUNK))
+
+
+@lru_cache(maxsize=64)
+def _load_kernel(shape: LawShape) -> Kernel | None:
+    """Return the compiled steps of a law; None where there is no compiler."""
+    sizes = zip(("NY", "NW", "NP"), shape.row_sizes[1:], strict=True)
+    constants = define_constants({"NK": shape.kept, **dict(sizes)})
+    template = files("seaopt.control.running").joinpath("law_run.c").read_text(encoding="utf-8")
+    return load_kernel("\n".join((constants, generate_code(_step_function(shape)), template)), "seaopt_laws")
+
+
+def _step_function(shape: LawShape) -> Any:
+    """Return the CasADi function (kept, numbers, reference, measured, further, place) -> (kept+, command)."""
     kept, numbers = ca.SX.sym("kept", shape.kept), ca.SX.sym("numbers", sum(shape.number_sizes))
-    r, y = ca.SX.sym("r"), ca.SX.sym("y", shape.measured)
-    more, variable = ca.SX.sym("w", len(shape.further)), ca.SX.sym("place", int(shape.schedule is not None))
+    names = "r", "y", "w", "place"
+    r, y, more, variable = (ca.SX.sym(name, size) for name, size in zip(names, shape.row_sizes, strict=True))
     command, after = express_step(shape, numbers, kept, r, ca.vertsplit(y), ca.vertsplit(more), variable)
-    step = ca.Function("step", [kept, numbers, r, y, more, variable], [ca.densify(after), ca.densify(command)])
-    return DirectCall(step.mapaccum(CHUNK))
+    arguments = [kept, numbers, r, y, more, variable]
+    return ca.Function("seaopt_step", arguments, [ca.densify(after), ca.densify(command)])
 
 
 def _is_number(value: Any) -> Any:
