@@ -57,6 +57,21 @@ def test_a_later_loop_and_another_fault_are_named_together(controller, bench, fa
     assert np.sum(np.square(off)) < 10.6, off  # chi square of 2, 99.5 %
 
 
+@pytest.mark.parametrize("late", [0.4, 0.75])
+@pytest.mark.parametrize(("fault", "names"), [({"damping": 2.0}, ("b_r",)), ({"stiffness": 0.8}, ("k",))])
+def test_an_earlier_loop_and_another_fault_are_named_together(controller, bench, fault, names, late):
+    """Firmware that puts a command out within the tick of its reading, where a whole one was certified."""
+    ((_, factor),) = fault.items()
+    log = bench.log(replace(scale(**fault), late=late), REFERENCE, noise=2.0, seed=2)
+    result = accept(controller, log)
+    first, early = result.differences.found[0], 1e-3 * (late - 1.0)
+    delay, other = find_part(first, "delay")[0], find_part(first, *names)
+    assert first.explains > 0.95 and len(first.beside) == 1, first
+    assert delay.low <= early <= delay.high and delay.high - delay.low < 2e-4, delay
+    assert abs(other[1] / factor - 1.0) < 0.02, other
+    assert f"{abs(1e3 * delay.value):.3g} ms earlier than in the model" in " ".join(str(result).split())
+
+
 @pytest.mark.parametrize("seed", [3, 4])
 def test_a_small_fault_beside_a_later_loop_is_named(controller, bench, monkeypatch, seed):
     """The delay alone leaves less than twice the noise, and more than noise does of a right model."""

@@ -6,6 +6,7 @@ reference and cut as the log is, since it depends on amplitude; two periods of e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.control import Controller, sample
+from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import LogError
 from seaopt.machine.design_run import RTOL, run_design
 from seaopt.machine.differences.few_periods import find_most_noise, find_widening
@@ -101,7 +103,9 @@ class Comparison:
     def linearise(self, values: ParameterSet) -> Lines:
         """Return the response of the model, linear as it slides."""
         law, seen = self.controller, self.controller.see(take_sliding(self.plant, values))
-        timing = law.sample_time_s / self.rate, law.compute_delay_samples
+        period = law.sample_time_s / self.rate
+        ticks, values = _shift_early(values, period)
+        timing = period, law.compute_delay_samples - ticks
         sampled = sample(seen, law.delay(values), self.names, law.per_effort, *timing)
         return np.concatenate([sampled.responses(self.rate * part.f).ravel() for part in self.measured])
 
@@ -138,3 +142,13 @@ class Comparison:
             effort = np.mean(rows.effort / rows.reference, axis=0)
             parts += [np.mean(shown[name] / rows.reference, axis=0) / effort for name in self.names]
         return np.concatenate(parts)
+
+
+def _shift_early(values: ParameterSet, period_s: float) -> tuple[int, ParameterSet]:
+    """Return by how many whole ticks a loop is earlier, and the values with what is left of its delay, which is none or
+    later.
+    """
+    late = [parameter for name, parameter in values.items() if name == DELAY and parameter.value < 0.0]
+    ticks = sum(math.ceil(-parameter.value / period_s) for parameter in late)
+    left = (replace(parameter, value=parameter.value + ticks * period_s) for parameter in late)
+    return ticks, values.with_parameters(*left)

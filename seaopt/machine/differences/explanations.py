@@ -198,7 +198,7 @@ def _list_knobs(case: Case) -> list[Knob]:
         for name, each in case.comparison.plant.complete(case.values).items()
         if each.value and name not in DELAYS
     ]
-    return [*parameters, make_delay(case.comparison.controller.sample_time_s)]
+    return [*parameters, make_delay(case.comparison)]
 
 
 def _list_starts(
@@ -206,15 +206,14 @@ def _list_starts(
 ) -> list[Start]:
     """Return the best of each kind of causes that a second can be tried beside. `limited`: the model of `limit`."""
     starts, knobs = list[Start](), {knob.parameter.name: knob for knob in _list_knobs(case)}
-    period = case.comparison.controller.sample_time_s
     for kind in kinds:
         for each in kind:
             what, value = each.difference, each.difference.value
             if what.kind == "parameter":
                 start = knobs[what.name], math.log(value), case.comparison
             elif what.kind == "delay":
-                knob = make_delay(period)
-                start = knob, max(value / period, 0.0), case.comparison
+                knob = make_delay(case.comparison)
+                start = knob, max(value / knob.sample_time_s, knob.earliest), case.comparison
             elif each is limit and limited is not None:
                 start = make_knob(limited, value), 0.0, limited
             else:
@@ -311,7 +310,7 @@ def _try_shapes(case: Case) -> Iterator[Tried]:
 
 def _simulate_delay(case: Case, shaped: Tried) -> Tried:
     """Return the delay that fits best, from one on that is about it: with dry friction the loop moves otherwise."""
-    knob = make_delay(case.comparison.controller.sample_time_s)
+    knob = make_delay(case.comparison)
     size = np.array([shaped.difference.value / knob.sample_time_s])
     search = Search(knobs=(knob,), sizes=size, model=case.model, slopes=case.slopes)
     (model,) = case.comparison.predict([search.place(case.values)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,11 +37,12 @@ class Knob:
     kind: str  # parameter, drive limit, delay
     parameter: Parameter  # at the value that its size counts from
     sample_time_s: float = 1.0
+    earliest: float = 0.0  # of a delay
 
     @property
     def ends(self) -> tuple[float, float]:
         """Between which its size lies."""
-        return (0.0, math.inf) if self.kind == "delay" else (-MOST_LOG, MOST_LOG)
+        return (self.earliest, math.inf) if self.kind == "delay" else (-MOST_LOG, MOST_LOG)
 
     def limit(self, size: float) -> tuple[float, float]:
         """Return between what its size may change in a round."""
@@ -84,9 +85,14 @@ def find_end(factor: float) -> int:
     return int(factor >= end) - int(factor <= 1.0 / end)
 
 
-def make_delay(sample_time_s: float) -> Knob:
-    """Return the delay beyond that which was certified."""
-    return Knob(kind="delay", parameter=Parameter(name=DELAY, value=0.0, unit="s"), sample_time_s=sample_time_s)
+def make_delay(comparison: Comparison) -> Knob:
+    """Return the delay beside that which was certified: earlier by no more than the law has of it in whole ticks, and
+    not where the model is simulated.
+    """
+    law = comparison.controller
+    earliest = 0.0 if comparison.simulates else -float(law.compute_delay_samples)
+    parameter = Parameter(name=DELAY, value=0.0, unit="s")
+    return Knob(kind="delay", parameter=parameter, sample_time_s=law.sample_time_s, earliest=earliest)
 
 
 @record(eq=False)
@@ -121,8 +127,15 @@ class Search:
 
 def find_slopes(comparison: Comparison, spread: Spread, values: ParameterSet, model: Lines) -> Slopes:
     """Return what each value that was drawn adds to the logarithm of a model's response, for its own spread."""
-    moved = comparison.predict([place_values(comparison.plant, values, place) for place in spread.places])
+    moved = comparison.predict([_place(comparison, values, place) for place in spread.places])
     return np.log(np.array(moved).reshape(-1, model.size) / model)
+
+
+def _place(comparison: Comparison, values: ParameterSet, place: Mapping[str, float]) -> ParameterSet:
+    """Return values with those of a draw in place of the nominal; a loop that is earlier, as no draw is, stays so."""
+    early = [parameter for name, parameter in values.items() if name == DELAY and parameter.value < 0.0]
+    within = values.with_parameters(*(replace(parameter, value=0.0) for parameter in early))
+    return place_values(comparison.plant, within, place).with_parameters(*early)
 
 
 def refine(
