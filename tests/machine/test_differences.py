@@ -18,7 +18,7 @@ from seaopt.machine.response.discs import Ratio
 from seaopt.machine.stepped import make_setting, play, run_setting
 from seaopt.machine.ticks import find_edges, take_ticks
 from tests.machine.simulator import Machine
-from tests.machine.test_response import REFERENCE
+from tests.machine.test_response import LINES, REFERENCE
 
 RANGES = {"eta": (0.95, 1.05), "b_r": (0.8 * 1.31e-4, 1.2 * 1.31e-4)}
 RIGHT = Machine()
@@ -74,6 +74,24 @@ def test_a_mode_stays_a_mode_beside_what_was_certified(controller, bench):
     machine = replace(scale(per_ampere=1.04, damping=1.15)).with_mode(40.0)
     first = accept(controller, bench.log(machine, REFERENCE)).found[0]
     assert first.kind == "mode" and np.isclose(first.value, 40.0, rtol=0.05)
+
+
+@pytest.mark.parametrize(("hertz", "share"), [(40.0, 0.15), (25.0, 0.05)])
+def test_a_modes_size_has_an_interval_about_that_of_the_equations(controller, bench, hertz, share):
+    """A mass on a spring at the nut adds m2 s^2 (k2 + c2 s)/(m2 s^2 + c2 s + k2) to M s^2 + b s + k."""
+    machine, off = RIGHT.with_mode(hertz, share), list[float]()
+    s = 2j * np.pi * LINES
+    stretched = machine.stiffness2 + machine.damping2 * s
+    alone = RIGHT.mass * s**2 + RIGHT.damping * s + RIGHT.stiffness
+    whole = alone + machine.mass2 * s**2 * stretched / (machine.mass2 * s**2 + stretched)
+    truth = np.max(np.abs(np.log(np.abs(alone / whole))))
+    for seed in (1, 2, 3):
+        first = so.accept(controller, [bench.log(machine, REFERENCE, seed=seed)]).differences.found[0]
+        assert first.kind == "mode" and first.changes_low < first.changes < first.changes_high, first
+        low, middle, high = np.log([first.changes_low, first.changes, first.changes_high])
+        off.append((middle - truth) / ((high - low) / 3.92))
+        assert high - low < 0.5 * truth, (low, high, truth)
+    assert np.sum(np.square(off)) < 12.8, off  # chi square of 3, 99.5 %
 
 
 def with_encoder(log, machine, sign=1.0):

@@ -14,8 +14,9 @@ spring.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ EVERY = 0.75  # of the law's rate, above which a log has each of its ticks
 HALF = 0.5  # of what the best cause explains, and of what a gain does, from which on others are looked at
 MODE_DAMPINGS = (0.02, 0.1)
 SEEN = 5.0  # std by which a line differs where a mode is looked for
+SMALL = 1e-5  # of a size, for slopes
 LEAST_DAMPING, MOST_DAMPED = math.log(1e-4), 0.3
 # Over that of the clock, at which timers step a law by mistake; the first two are tried always.
 USUAL_RATES = (0.5, 2.0, 0.1, 0.2, 0.25, 1.0 / 3.0, 3.0, 4.0, 5.0, 10.0)
@@ -327,15 +329,15 @@ def _try_mode(fit: SizeFit, model: Lines) -> Iterator[Tried]:
     late = (controller.delay_samples + 0.5) * controller.sample_time_s
     held = np.sinc(f * controller.sample_time_s) * np.exp(-2j * np.pi * f * late)
     moved = -model / held * (2.0 * np.pi * f) ** 2
-    low, high = math.log(0.5 * f[0]), math.log(2.0 * np.max(f))
+    lowest, highest = math.log(0.5 * f[0]), math.log(2.0 * np.max(f))
 
     def pair(hertz: Any, damping: Any) -> Lines:
         return 1.0 - (f / hertz) ** 2 + 2j * damping * f / hertz
 
     def take(x: Float[np.ndarray, " k"], k: int) -> tuple[Any, Any]:
-        return np.exp(np.clip(x[k], low, high)), np.exp(np.clip(x[k + 1], LEAST_DAMPING, 0.0))
+        return np.exp(np.clip(x[k], lowest, highest)), np.exp(np.clip(x[k + 1], LEAST_DAMPING, 0.0))
 
-    def absorb(x: Float[np.ndarray, " k"]) -> Lines:
+    def absorb(x: Float[np.ndarray, " k"], scale: float) -> Lines:
         hertz, damping = take(x, 0)
         return 1.0 / (1.0 + x[2] * scale * moved * (1.0 + 2j * damping * f / hertz) / pair(hertz, damping))
 
@@ -343,27 +345,43 @@ def _try_mode(fit: SizeFit, model: Lines) -> Iterator[Tried]:
         return pair(*take(x, 0)) / pair(*take(x, 2))
 
     misfit = np.abs((comparison.response - model) / comparison.std)
-    best: tuple[Best, float | None] | None = None
+    best: tuple[Best, Callable[[Any], Lines]] | None = None
     apart = np.where(misfit > SEEN, np.abs(comparison.response / model - 1.0), 0.0)
     for line in np.unique(np.concatenate([np.argsort(-misfit)[:2], np.argsort(-apart)[:2]])):
-        at, scale = math.log(f[line]), 1.0 / abs(moved[line])
+        at, scale = math.log(f[line]), float(1.0 / abs(moved[line]))
         for damping in map(math.log, MODE_DAMPINGS):
-            starts = [(absorb, [at, damping, sign * 0.1]) for sign in (1.0, -1.0)]
+            starts = [(partial(absorb, scale=scale), [at, damping, sign * 0.1]) for sign in (1.0, -1.0)]
             starts += [(divide, [at, damping, at + step, damping]) for step in (-0.05, 0.05)]
             for shape, start in starts:
                 found = fit.solve(lambda x, shape=shape: model * shape(x), start)
                 hertz, damped = take(found.sizes, 0)
                 inside = f[0] < hertz < np.max(f) and damped < MOST_DAMPED
                 if inside and (best is None or found.left < best[0].left):
-                    best = found, float(hertz / take(found.sizes, 2)[0]) if shape is divide else None
+                    best = found, shape
     if best is not None:
-        found, size = best
+        found, shape = best
         value, far = float(take(found.sizes, 0)[0]), SURE * float(found.stds[0])
         low, high = (value * math.exp(-far), value * math.exp(far)) if far < 1.0 else (None, None)
-        changes = np.abs(np.log(np.abs(found.response / model)))
+        changes, least, most = _find_change(found, shape)
         difference = Difference(
-            kind="mode", name="mode", value=value, low=low, high=high, unit="Hz", explains=0.0, size=size,
-            changes=math.exp(float(np.max(changes))),
+            kind="mode", name="mode", value=value, low=low, high=high, unit="Hz", explains=0.0,
+            size=value / float(take(found.sizes, 2)[0]) if shape is divide else None,
+            changes=changes, changes_low=least, changes_high=most,
         )  # fmt: skip
         # it has some sizes where others have one
         yield Tried(difference=difference, left=found.left + 3.0, response=found.response)
+
+
+def _find_change(found: Best, shape: Callable[[Any], Lines]) -> tuple[float, float | None, float | None]:
+    """Return by which factor a shape changes the response at a line, at most, and the interval of that factor."""
+
+    def measure(x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " m"]:
+        return np.log(np.abs(shape(x)))
+
+    sizes = measure(found.sizes)
+    line = int(np.argmax(np.abs(sizes)))
+    steps = SMALL * np.eye(found.sizes.size)
+    slopes = [(measure(found.sizes + step)[line] - measure(found.sizes - step)[line]) / (2.0 * SMALL) for step in steps]
+    size, far = abs(float(sizes[line])), SURE * math.sqrt(max(float(slopes @ found.covariance @ slopes), 0.0))
+    told = 0.0 < far < size
+    return math.exp(size), math.exp(size - far) if told else None, math.exp(size + far) if told else None

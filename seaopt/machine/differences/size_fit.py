@@ -35,7 +35,9 @@ class Difference:
     alike: tuple[str, ...] = ()  # parameters that would explain as much
     alike_values: tuple[float, ...] = ()  # their factors
     size: float | None = None  # of a mode: its zero's frequency over its pole's; of a rate: over that of the log
-    changes: float | None = None  # of a mode: by which factor the response at a line is another one, at most
+    changes: float | None = None  # of a mode: by which factor it makes the response at a line another one, at most
+    changes_low: float | None = None  # its interval
+    changes_high: float | None = None
     beside: tuple[Difference, ...] = ()  # what differs besides, of two that explain it together
     untold: bool = False  # the log does not tell it from the one that is named first
 
@@ -75,9 +77,15 @@ class Best:
     """Sizes that fit best."""
 
     sizes: Float[np.ndarray, " k"]
-    stds: Float[np.ndarray, " k"]
+    covariance: Float[np.ndarray, "k k"]
     left: float  # of the misfit
     response: Lines
+
+    @property
+    def stds(self) -> Float[np.ndarray, " k"]:
+        """Of the sizes; infinite of one that nothing tells."""
+        variances = np.diag(self.covariance)
+        return np.where(variances > 0.0, np.sqrt(np.maximum(variances, 0.0)), np.inf)
 
 
 @record(eq=False)
@@ -106,12 +114,11 @@ class SizeFit:
         first = np.array([*start, *(0.5 * (leeway.low + leeway.high))])  # at an edge the search would stay
         if not first.size:
             left = 0.5 * float(np.sum(errors(first) ** 2))
-            return Best(sizes=first, stds=first, left=left, response=respond(first))
+            return Best(sizes=first, covariance=np.zeros((0, 0)), left=left, response=respond(first))
         low, high = np.reshape(ends or [(-math.inf, math.inf)] * k, (k, 2)).T
         edges = [np.concatenate([low, leeway.low]), np.concatenate([high, leeway.high])]
         scale = np.concatenate([np.maximum(np.abs(start), 1e-3), leeway.std])
         solved = least_squares(errors, first, x_scale=scale, bounds=edges, max_nfev=200)
-        left, variances = float(solved.cost), np.diag(np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True))[:k]
-        stds = np.sqrt(max(left / measured.size, 1.0) * variances) * self.comparison.widening
-        stds = np.where(variances > 0.0, stds, np.inf)
-        return Best(sizes=solved.x[:k], stds=stds, left=left, response=respond(solved.x))
+        left, covariance = float(solved.cost), np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True)[:k, :k]
+        covariance = covariance * max(left / measured.size, 1.0) * self.comparison.widening**2
+        return Best(sizes=solved.x[:k], covariance=covariance, left=left, response=respond(solved.x))

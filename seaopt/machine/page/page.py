@@ -243,7 +243,10 @@ def _show_range(each: Difference) -> str:
     if each.low is None or each.high is None:
         return ""
     scale, unit = {"delay": (1e3, " ms"), "mode": (1.0, " Hz")}.get(each.kind, (1.0, ""))
-    return f"{format_number(scale * each.low, 3)} to {format_number(scale * each.high, 3)}{unit}"
+    size = ""
+    if each.changes_low is not None:
+        size = f", {format_number(each.changes_low, 3)} to {format_number(each.changes_high, 3)} times"
+    return f"{format_number(scale * each.low, 3)} to {format_number(scale * each.high, 3)}{unit}{size}"
 
 
 def _describe_differences(result: Acceptance, differences: Differences) -> Section:
