@@ -65,6 +65,16 @@ UNDECIDED = ("rounding", *SHORT.values(), *ROWS)
 
 
 @record
+class EditedGain:
+    """One gain of a table that was edited beside another one."""
+
+    name: str
+    points: tuple[float, ...]
+    factor: float
+    everywhere: bool  # at all points that the log reaches
+
+
+@record
 class Edited:
     """Where the table of a schedule was edited."""
 
@@ -73,6 +83,7 @@ class Edited:
     points: tuple[float, ...]  # of the edited gains
     factor: float | None  # of the gains; None: each has its own
     everywhere: bool = False  # at all points that the log reaches
+    pair: tuple[EditedGain, ...] = ()  # two gains, not at one point
 
 
 @record
@@ -217,6 +228,16 @@ def _make_edit(setting: Setting, edit: Edit) -> Alternative:
     assert isinstance(law, RunnableSchedule)
     changed, (name, *further), point = edit.change(law), edit.names, edit.points[0]
     alone = len(edit.points) == 1
+    pair = tuple(
+        EditedGain(
+            name=entries[0][0],
+            points=tuple(float(law.table.points[number]) for _, number in entries),
+            factor=factor,
+            everywhere=len(entries) > 1,
+        )
+        for entries, factor in zip(edit.shared, edit.factors, strict=True)
+        if len(edit.shared) > 1 and not alone
+    )
     exported, gains = (
         {each: float(table.gains[each][point]) for each in edit.names} for table in (law.table, changed.table)
     )
@@ -232,7 +253,8 @@ def _make_edit(setting: Setting, edit: Edit) -> Alternative:
             unit=law.table.unit,
             points=tuple(law.table.points[list(edit.points)].tolist()),
             factor=edit.factors[0] if len(edit.factors) == 1 else None,
-            everywhere=not alone,
+            everywhere=not alone and not pair,
+            pair=pair,
         ),
     )
 

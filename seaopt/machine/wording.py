@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from seaopt.control import Controller
 from seaopt.formatting import format_number, join_words
-from seaopt.machine.causes import Cause, Edited
+from seaopt.machine.causes import Cause, Edited, EditedGain
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.gains.free_gains import SAME_GAINS
@@ -79,8 +79,7 @@ def say_cause(cause: Cause) -> str:
         case "factor":
             return f"{cause.what} is {value} times what it should be"
         case "gain" if cause.edited is not None:
-            factor = format_number(cause.edited.factor)
-            return f"the gain {cause.what} is {factor} times what was exported {_say_points(cause.edited)}"
+            return _say_edited(cause.what, cause.edited.factor, cause.edited, cause.edited)
         case "gain":
             return f"the gain {cause.what} is {value}"
         case "limit" if cause.what == "behind the law":
@@ -148,22 +147,29 @@ def say_bias(bias: Bias) -> str:
     )
 
 
-def _say_points(edited: Edited) -> str:
+def _say_edited(name: str, factor: float | None, edited: Edited, where: Edited | EditedGain) -> str:
+    """Return by what a gain of a table was multiplied, and where."""
+    return f"the gain {name} is {format_number(factor)} times what was exported {_say_points(edited, where)}"
+
+
+def _say_points(edited: Edited, where: Edited | EditedGain) -> str:
     """Return where a table was edited."""
-    if edited.everywhere:
+    if where.everywhere:
         return f"at all points of {edited.over} that the log reaches"
-    return f"at {edited.over} = {format_number(edited.points[0])}{unit_after(edited.unit)}"
+    return f"at {edited.over} = {format_number(where.points[0])}{unit_after(edited.unit)}"
 
 
 def _say_gains(cause: Cause) -> str:
     """Return which gains a law has that are not the exported ones, the most different first."""
+    if cause.edited is not None and cause.edited.pair:
+        return ", and ".join(_say_edited(part.name, part.factor, cause.edited, part) for part in cause.edited.pair)
     found, exported = cause.gains or {}, cause.exported or {}
     apart = {name: abs(found[name] - value) / max(abs(found[name]), abs(value)) for name, value in exported.items()}
     named = [name for name in sorted(apart, key=lambda name: -apart[name]) if apart[name] > SAME_GAINS]
     values = [f"{name} {format_number(found[name])} ({format_number(exported[name])} exported)" for name in named]
     whose = "" if cause.what == "law" else f", those of {cause.what}"
     if cause.edited is not None:
-        return f"the gains {_say_points(cause.edited)} are others: {', '.join(values)}"
+        return f"the gains {_say_points(cause.edited, cause.edited)} are others: {', '.join(values)}"
     return f"it is a law with another set of gains{whose}: {', '.join(values)}"
 
 

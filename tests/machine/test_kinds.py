@@ -365,6 +365,33 @@ def test_an_edited_gain_of_a_table_is_named_with_its_point_and_factor(
     assert said in say_cause(first)
 
 
+@pytest.mark.parametrize(
+    ("factors", "pair"),
+    [
+        ({"k_p": [1.0, 1.3], "k_i": [0.8, 1.0]}, {"k_p": (1.3, [8e5]), "k_i": (0.8, [5e5])}),
+        ({"k_p": [0.8, 0.8], "k_d": [1.3, 1.3]}, {"k_p": (0.8, None), "k_d": (1.3, None)}),
+        ({"k_i": [1.5, 1.5], "k_p": [1.0, 0.9]}, {"k_i": (1.5, None), "k_p": (0.9, [8e5])}),
+        ({"T_f": [1.5, 1.5], "k_p": [1.25, 1.0]}, {"T_f": (1.5, None), "k_p": (1.25, [5e5])}),
+    ],
+)
+def test_two_edited_gains_of_a_table_are_named_each_with_its_points_and_factor(
+    schedule, compiler, tmp_path, factors, pair
+):
+    places = 6.5e5 + 1.4e5 * np.sin(2e-3 * np.arange(REFERENCE.size))
+    log = Bench(compiler, tmp_path, edit(schedule, factors)).log(Machine(), REFERENCE, places=places, decimals=3)
+    (row,) = so.accept(schedule, [log]).replays
+    first = row.causes[0]
+    assert not row.met and first.explains and first.edited is not None, row
+    found = {part.name: part for part in first.edited.pair}
+    assert found.keys() == pair.keys(), found
+    for name, (factor, points) in pair.items():
+        assert found[name].factor == pytest.approx(factor, rel=0.01)
+        assert (None if found[name].everywhere else list(found[name].points)) == points
+        where = "at all points of k" if points is None else f"at k = {format_number(points[0])} N/m"
+        said = f"the gain {name} is {format_number(found[name].factor)} times what was exported {where}"
+        assert said in say_cause(first)
+
+
 def test_an_entry_of_the_table_that_was_edited_in_the_c_is_named(schedule, compiler, tmp_path):
     """Its anti-windup stays what was exported."""
     so.export(schedule, tmp_path / "law", allow_infeasible=True)

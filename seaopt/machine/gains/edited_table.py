@@ -4,13 +4,15 @@ With factors :math:`\theta` of the gains at the points, all one in what was expo
 :math:`u(\theta)`, affine in most of them while no limit is active. A column :math:`\partial u/\partial\theta` is the
 difference of two replays, the variable as logged. Least squares over it and what a state at the first row adds gives a
 factor, at once or by Gauss-Newton steps (filters' time constants). Of each kind of edit the ones that leave least are
-proposed: one gain at one point, one gain at all points, and all gains at one point, by one factor or each by its own.
+proposed: one gain at one point, one gain at all points, all gains at one point, by one factor or each by its own, and
+two gains, each at one point or at all.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,7 +24,7 @@ from seaopt.machine.stepped import HEAD, SAME_PLACE, Setting, find_at_limit, fin
 from seaopt.records import record
 
 STEP = 0.01  # of a factor, by which a column is made
-LIKELY = 2  # edits of each kind that are proposed
+LIKELY, LIKELY_PAIRS = 2, 6  # edits of each kind, and pairs, that are proposed
 ROUNDS, SAME = 8, 1e-7  # steps at most, and the relative step that is none
 FURTHEST = 3.0  # times, that a factor moves in a step where the law is not affine in it
 LARGER = ("k_p", "k_i", "k_d", "k_r")  # with which all of a law at a point grows
@@ -79,11 +81,27 @@ def list_edits(setting: Setting) -> Iterator[Edit]:
             (fit.rate([np.sum([columns[entry] for entry in part], axis=0) for part in shared]), shared)
             for shared in kind
         ]
-        for _, shared in sorted(rated, key=lambda pair: pair[0])[:LIKELY]:
-            for exported in (False, True)[: 1 if np.all(fit.free) else 2]:
-                edit = fit.refine(shared, exported=exported)
-                if edit is not None:
-                    yield edit
+        yield from fit.refine_each([shared for _, shared in sorted(rated, key=lambda pair: pair[0])[:LIKELY]])
+    yield from fit.refine_each(_list_pairs(fit, columns))
+
+
+def _list_pairs(fit: _Fit, columns: dict[Entry, Float[np.ndarray, " n"]]) -> list[tuple[Shared, ...]]:
+    """Return the pairs of edits, each of one gain at a point or at all of them, that leave least; none of two gains at
+    one point, of which all gains there are one kind of edit.
+    """
+    single, everywhere = _list_kinds(fit.law, columns)[:2]
+    parts = [part for (part,) in (*single, *everywhere)]
+    table = np.column_stack([np.sum([columns[entry] for entry in part], axis=0) for part in parts])
+    table /= np.linalg.norm(table, axis=0)
+    alike, wanted = table.T @ table, table.T @ fit.target
+    rated = list[tuple[float, tuple[Shared, ...]]]()
+    for (i, one), (j, other) in combinations(enumerate(parts), 2):
+        apart = 1.0 - alike[i, j] ** 2
+        if one[0][0] == other[0][0] or len({point for _, point in (*one, *other)}) == 1 or apart < SAME:
+            continue
+        taken = wanted[i] ** 2 + (wanted[j] - alike[i, j] * wanted[i]) ** 2 / apart
+        rated.append((-float(taken), (one, other)))
+    return [shared for _, shared in sorted(rated, key=lambda pair: pair[0])[:LIKELY_PAIRS]]
 
 
 def _list_entries(law: RunnableSchedule) -> list[Entry]:
@@ -168,7 +186,20 @@ class _Fit:
 
     def rate(self, columns: Sequence[Float[np.ndarray, " m"]]) -> float:
         """Return what an edit leaves, by its columns at what was exported."""
-        return self.solve(columns, self.leave_state(self.setting.ticks.command - self.exported))[1]
+        return self.solve(columns, self.target)[1]
+
+    @property
+    def target(self) -> Float[np.ndarray, " m"]:
+        """By what the logged commands differ from those of what was exported."""
+        return self.leave_state(self.setting.ticks.command - self.exported)
+
+    def refine_each(self, kind: Sequence[tuple[Shared, ...]]) -> Iterator[Edit]:
+        """Yield edits with the factors that fit best, with the anti-windup before and after where a limit acts."""
+        for shared in kind:
+            for exported in (False, True)[: 1 if np.all(self.free) else 2]:
+                edit = self.refine(shared, exported=exported)
+                if edit is not None:
+                    yield edit
 
     def refine(self, shared: tuple[Shared, ...], *, exported: bool) -> Edit | None:
         """Return an edit with the factors that fit best; None where no law has them."""
