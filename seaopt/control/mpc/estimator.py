@@ -249,7 +249,7 @@ class Estimator:
                 "make one with the log's sample_time_s"
             )
         if len(log.segments) > 1:
-            raise ControlError(f"{log.source} has gaps; run each stretch by itself (log.between)")
+            raise ControlError(f"{log.source} has gaps; run each segment by itself (log.between)")
         y = np.column_stack([log[name] for name in self.outputs])
         for name, channel in zip(self.outputs, y.T, strict=True):
             if not np.all(np.isfinite(channel)):

@@ -62,7 +62,7 @@ def estimate_noise(
     drive = next(iter(plant.inputs))
     for name in outputs:
         if not np.ptp(log[name]) > 0.0:  # NaN too
-            raise ControlError(f"{log.source}: {name} stands still or has missing samples; give a stretch that moves")
+            raise ControlError(f"{log.source}: {name} stands still or has missing samples; give a part that moves")
     sensors = {name: _third_difference(log[name]) for name in outputs}
     base = NoiseModel(sensor_std=sensors, input_noise={drive: 1.0})
 

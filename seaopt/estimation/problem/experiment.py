@@ -331,7 +331,7 @@ class Experiment:
         if self.gaps == "error" and len(self.log_segments) > 1:
             raise self._refuse(
                 f'the log has {format_count(len(self.log_segments) - 1, "gap")} and gaps = "error"; use '
-                'gaps = "split", or slice_s to choose a stretch'
+                'gaps = "split", or slice_s to choose a segment'
             )
 
     def _check_each_output(self) -> None:
@@ -530,6 +530,6 @@ def check_shots(experiment: Experiment, longest: int, shots: int, setting: str) 
     remedy = f"give {possible} or fewer" if possible > 1 else "leave it out, and use a longer log or OutputError()"
     raise EstimationError(
         f"experiment {experiment.name}: {setting} leaves {longest / shots:.3g} samples per shot, of {longest} in the "
-        f"longest stretch; a shot of {experiment.plant.name} starts from {states} unknown states and needs at least "
+        f"longest segment; a shot of {experiment.plant.name} starts from {states} unknown states and needs at least "
         f"{least} samples: {remedy}"
     )
