@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from seaopt.estimation import Fit
-from seaopt.estimation.result.findings import DerivedFigure, LogValues
+from seaopt.estimation.result.findings import DerivedFigure
 from seaopt.estimation.result.trials import spell_parameters, spell_parts
 from seaopt.formatting import MISSING, format_count, format_number, join_words
 from seaopt.parameters import Parameter
@@ -150,10 +150,11 @@ def _describe_logs(fit: Fit) -> Iterator[Section]:
         (name, format_number(log.amplitude, 3), format_number(log.excess, 2)) for name, log in fit.logs.items()
     )
     rows = tuple(
-        (parameter, f"{fit.parameters[parameter].value:.6g}", name, *_find_own_value(log, parameter))
+        (parameter, f"{fit.parameters[parameter].value:.6g}", name, f"{value:.6g}", _spread(std))
         for parameter in fit.covariance.names
         for name, log in fit.logs.items()
         if parameter in log.values
+        for value, std in [log.values[parameter]]
     )
     head = ("parameter", "by all", "log", "by it alone", "std")
     yield Section(
@@ -165,11 +166,6 @@ def _describe_logs(fit: Fit) -> Iterator[Section]:
         ),
         remarks=("amplitude: standard deviation of the spring's force or torque, in the output's unit",),
     )
-
-
-def _find_own_value(log: LogValues, parameter: str) -> tuple[str, str]:
-    value, std = log.values[parameter]
-    return f"{value:.6g}", _spread(std)
 
 
 def _tabulate_figure(name: str, figure: DerivedFigure, remark: str) -> tuple[str, ...]:

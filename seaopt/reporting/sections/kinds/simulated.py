@@ -28,16 +28,14 @@ def judge(result: Simulated | LargeSignal, commands: Commands) -> Verdict | None
 
 def describe(result: Simulated | LargeSignal) -> list[Section]:
     """Return the sections of every part, and why parts are left out; or the section of a sweep of amplitudes."""
-    return [_describe_sweep(result)] if isinstance(result, LargeSignal) else _describe_parts(result)
-
-
-def _describe_parts(simulated: Simulated) -> list[Section]:
-    ports = (part for part in (simulated.passivity, simulated.environments) if part is not None)
+    if isinstance(result, LargeSignal):
+        return [_describe_sweep(result)]
+    ports = (part for part in (result.passivity, result.environments) if part is not None)
     return [
-        *([] if simulated.verification is None else verification.describe(simulated.verification)),
-        *map(_describe_sweep, simulated.large_signal),
+        *([] if result.verification is None else verification.describe(result.verification)),
+        *map(_describe_sweep, result.large_signal),
         *(section for port in ports for section in contact.describe(port)),
-        *list_notes("the simulation", list_left_out(simulated)),
+        *list_notes("the simulation", list_left_out(result)),
     ]
 
 
