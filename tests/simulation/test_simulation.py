@@ -332,7 +332,7 @@ def test_derivatives_are_finite_differences(case, options, thor):
         with pytest.raises(AssertionError):
             check_derivative(columns[:, :, column] * (1 + 1e-5), numeric)
     for o in range(2):
-        own = 1 + layout.shared + layout.nx + (o * layout.own if layout.corrected else 0)
+        own = 1 + layout.shared + layout.nx + (o * layout.per_output if layout.corrected else 0)
         for k, (what, place, step) in enumerate(
             [("offset", o, 0.01), ("drift", (o, 0), 0.01), ("drift", (o, 1), 0.01), ("gain", o, 1e-5)]
         ):
