@@ -19,6 +19,9 @@ of a command that is as good as the same, :math:`a = \Phi^T d/\Phi^T\Phi` is the
   reading or command that is halved, of a tick's delay. Of laws with a part left out, or made for another rate, it says
   which are not excluded: few references tell all of them.
 - Else the log cannot tell. The std falls with the root of the periods, which says how many would do.
+
+A law under an outer loop with a stiffness is one law with it, of x_0, the readings and the link's position. Without a
+stiffness the link's place drifts, and has no lines.
 """
 
 from __future__ import annotations
@@ -34,6 +37,8 @@ from jaxtyping import Complex, Float
 from seaopt.control import Controller, RunnableSchedule, ScheduledController
 from seaopt.control.laws.structures import Gains
 from seaopt.control.loops.law import Law
+from seaopt.control.loops.moved_link import enclose_law
+from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import LogError
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_parts, name_factor
@@ -155,13 +160,17 @@ class Table:
     blocks: Blocks
     ticks_per_row: int
     made: Parts
+    outer: OuterLoop | None  # around the law
     leakage: Float[np.ndarray, "k n"]  # an orthonormal basis of what a state at the start of a period adds
     rounding: Float[np.ndarray, " m"]  # std of each part of a command, of what the log is rounded to
 
     @classmethod
-    def make(cls, controller: Controller, ticks: Ticks, blocks: Blocks, ticks_per_row: int) -> Table:
+    def make(
+        cls, controller: Controller, ticks: Ticks, blocks: Blocks, ticks_per_row: int, outer: OuterLoop | None
+    ) -> Table:
         """Return the table of a log."""
-        responses = evaluate(controller.law, blocks, ticks_per_row)
+        law = _enclose(controller.law, controller.signals, outer)
+        responses = evaluate(law, blocks, ticks_per_row)
         steps = [find_quantisation(ticks.measured[:, i]) for i in range(ticks.measured.shape[1])]
         steps = [ticks.quantum / abs(controller.command.per_effort), *steps]
         gains = np.vstack([np.ones(blocks.f.size), np.abs(responses[1:])])
@@ -171,9 +180,21 @@ class Table:
             blocks=blocks,
             ticks_per_row=ticks_per_row,
             made=blocks.make_efforts(responses),
-            leakage=find_leakage(controller.law, blocks, ticks_per_row),
+            outer=outer,
+            leakage=find_leakage(law, blocks, ticks_per_row),
             rounding=each,
         )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is read."""
+        signals = self.controller.signals
+        outside = self.outer is not None and self.outer.position not in signals
+        return (*signals, self.outer.position) if outside and self.outer is not None else signals
+
+    def enclose(self, law: Law) -> Law:
+        """Return a law with the outer loop around it."""
+        return _enclose(law, self.controller.signals, self.outer)
 
     def project(self, commands: Parts) -> Parts:
         """Return commands without what a state at the start of a period adds."""
@@ -225,10 +246,10 @@ class Table:
         """Yield what may run in place of the law, or stand in its log; `place`: of the variable of a schedule."""
         controller, blocks, made = self.controller, self.blocks, self.made
         law, signals = controller.law, controller.signals
-        forward, *feedback = evaluate(law, blocks, self.ticks_per_row)
+        forward, *feedback = evaluate(self.enclose(law), blocks, self.ticks_per_row)
         fed = forward * blocks.reference
         parts = {"reference": fed, controller.command.input: made}
-        parts |= {name: feedback[i] * blocks.measured[:, i] for i, name in enumerate(signals)}
+        parts |= {name: feedback[i] * blocks.measured[:, i] for i, name in enumerate(self.names)}
         for name, part in parts.items():
             role: Role = "excluded" if np.any(part) else "tried"
             yield Shift(kind="factor", what=name, commands=-0.5 * part, base=1.0, role=role)
@@ -242,9 +263,25 @@ class Table:
             if first.signals == signals and math.isclose(first.sample_time_s, law.sample_time_s, rel_tol=1e-3):
                 stood = other.table.law(place) if isinstance(other, ScheduledController) else first.law
                 yield Shift(kind="another law", what=name, commands=self.differ(stood))
+        yield from self._list_outer()
         gains = read_gains(controller)
         if gains is not None:
             yield from self._list_gains(gains)
+
+    def _list_outer(self) -> Iterator[Shift]:
+        """Yield an outer loop of half the stiffness, of which x_0 is a part of the reference, or half the damping."""
+        if self.outer is None:
+            return
+        own, reference = self.enclose(self.controller.law), self.blocks.reference
+        for name in ("stiffness", "damping"):
+            half = replace(self.outer, **{name: 0.5 * getattr(self.outer, name)})
+            law = _enclose(self.controller.law, self.controller.signals, half)
+            given = reference * (0.5 if name == "stiffness" else 1.0)
+            commands = replace(self.blocks, reference=given).make_efforts(
+                evaluate(law, self.blocks, self.ticks_per_row)
+            )
+            role: Role = "excluded" if _matters(own, law) else "tried"
+            yield Shift(kind="factor", what=name, commands=commands - self.made, base=1.0, role=role)
 
     def _list_gains(self, gains: Gains) -> Iterator[Shift]:
         structure, period, law = self.controller.spec.structure, self.controller.sample_time_s, self.controller.law
@@ -262,14 +299,12 @@ class Table:
 
     def differ(self, law: Law) -> Parts:
         """Return what another law makes more than this one."""
-        return self.blocks.make_efforts(evaluate(law, self.blocks, self.ticks_per_row)) - self.made
+        return self.blocks.make_efforts(evaluate(self.enclose(law), self.blocks, self.ticks_per_row)) - self.made
 
     def is_alias(self, found: Off) -> bool:
         """Tell whether the law holds at what comes back as the lines, above half of the log's rate."""
-        reach = self.ticks_per_row // 2
-        responses = [
-            evaluate(self.controller.law, self.blocks, self.ticks_per_row, k) for k in range(-reach, reach + 1)
-        ]
+        reach, law = self.ticks_per_row // 2, self.enclose(self.controller.law)
+        responses = [evaluate(law, self.blocks, self.ticks_per_row, k) for k in range(-reach, reach + 1)]
         off = np.array([self.blocks.effort - self.blocks.make_efforts(each) for each in responses])
         nearest = np.argmin(np.mean(np.abs(off), axis=1), axis=0)
         chosen = np.take_along_axis(off, nearest[None, None, :], axis=0)[0]
@@ -288,8 +323,11 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
     controller, ticks, law = setting.controller, setting.ticks, setting.law
     if setting.linear.compensation is not None:
         return LineMatch(causes=(leave_open("terms", "law"),))
-    if ticks.rendered is not None:
+    outer = None if ticks.rendered is None else controller.outer
+    if outer is not None and not outer.stiffness:
         return LineMatch(causes=(leave_open("outer", "loop"),))
+    if outer is not None:
+        ticks = _take_given(ticks, controller.signals, outer)
     place, others = math.nan, keep_over(others, law.table.over if isinstance(law, RunnableSchedule) else None)
     if isinstance(law, RunnableSchedule):
         place = law.fallback if ticks.middle is None else ticks.middle
@@ -306,13 +344,13 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
     dry, phases = has_dry_friction(controller), blocks.realisations
     if dry and phases >= LEAST_PHASES:
         blocks = blocks.average()
-    table = Table.make(controller, ticks, blocks, ticks_per_row)
+    table = Table.make(controller, ticks, blocks, ticks_per_row, outer)
     tried = [table.try_late(late) for late in LATE]
     found, shifts = min(tried, key=lambda each: each.misfit), [*table.list_shifts(others, place)]
     every, possible = [*shifts, *table.list_late(found.late)], ()
     vectors = [table.average(shift.commands) for shift in every]
     if is_off(found, every, vectors):
-        named = [name_causes(each, shifts, vectors, controller.signals) for each in tried]
+        named = [name_causes(each, shifts, vectors, table.names) for each in tried]
         at = min(range(len(tried)), key=lambda k: named[k][0])
         found, causes = tried[at], named[at][1]
         if not causes or not causes[0].explains:
@@ -326,6 +364,21 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
     size = np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0)) * abs(controller.command.per_effort)
     allowed = float(np.sqrt(np.sum((found.std * size) ** 2)))
     return LineMatch(causes=causes, off=np.abs(found.mean) * size, allowed=allowed, late=found.late, possible=possible)
+
+
+def _enclose(law: Law, signals: Sequence[str], outer: OuterLoop | None) -> Law:
+    """Return a law that reads these signals with an outer loop around it, of what that is given as a force."""
+    if outer is None:
+        return law
+    return enclose_law(law, outer, signals.index(outer.position) if outer.position in signals else None, of_force=True)
+
+
+def _take_given(ticks: Ticks, signals: Sequence[str], outer: OuterLoop) -> Ticks:
+    """Return ticks with what the outer loop was given as their reference, and the position among the readings."""
+    assert ticks.given is not None
+    given, position = ticks.given.T
+    measured = ticks.measured if outer.position in signals else np.column_stack([ticks.measured, position])
+    return replace(ticks, reference=given, measured=measured, rendered=None)
 
 
 def evaluate(law: Law, blocks: Blocks, ticks_per_row: int, image: int = 0) -> Complex[np.ndarray, "k m"]:

@@ -20,7 +20,8 @@ from seaopt.units import unit_after
 EVERY_TICK = "of a log with every n-th tick"
 OPEN = {
     "terms": "terms of the law (friction, gravity, ripple) are not linear; log every tick",
-    "outer": "the outer loop runs between the rows, too; log every tick",
+    "outer": "the outer loop has no stiffness, so that the link drifts from period to period, and its lines tell "
+    "nothing; log every tick",
     "moving": "the schedule's variable moves; hold it at a value, or log every tick",
     "periods": "its reference has to repeat, a whole number of rows each time, three times at least and with the "
     "command below its limit; play such a one, or log every tick",

@@ -325,3 +325,40 @@ def test_the_link_of_a_schedule_is_where_its_variable_stood(impedance):
     link = knee, values.update(k_s=200.0)
     result = so.accept(schedule, [make_log(rows)], at=KNEE["k_s"], link=link)
     assert result.replayed and result.enclosed and result.differences.inside, result
+
+
+SLOW = multisine(1000, np.unique(np.round(np.geomspace(1, 60, 20)).astype(int)), 16, 0.05, 5)
+
+
+def keep_every(rows, every, **options):
+    log = make_log(rows, **options)
+    columns = {name: log[name][::every] for name in log.signals}
+    units = {name: log.signal(name).unit for name in log.signals}
+    return so.Log.from_arrays(time=log.time[::every], units=units, source="knee", **columns)
+
+
+@pytest.mark.parametrize("every", [2, 4])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_log_of_every_nth_tick_under_an_outer_loop_is_of_this_law(impedance, every, seed):
+    (row,) = so.accept(impedance, [keep_every(run(impedance, SLOW, seed=seed), every)]).replays
+    assert row.met and row.ticks_per_row == every, row
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "value"), [({"stiffness": 10.0}, "stiffness", 0.5), ({"damping": 0.5}, "damping", 0.5)]
+)
+def test_another_outer_loop_in_a_log_of_every_second_tick_is_named(impedance, changes, what, value):
+    (row,) = so.accept(impedance, [keep_every(run(impedance, SLOW, **changes), 2)]).replays
+    cause = row.causes[0]
+    assert not row.met and cause.explains and cause.what == what and np.isclose(cause.value, value, rtol=0.05), row
+
+
+def test_without_a_stiffness_a_log_of_every_second_tick_says_why_it_tells_nothing(damping):
+    result = so.accept(damping, [keep_every(run(damping, 20.0 * SLOW, stiffness=0.0), 2, unit="N m")])
+    assert not result.replayed and "the link drifts" in " ".join(str(result).split())
+
+
+def test_the_response_of_a_log_of_every_second_tick_under_an_outer_loop_is_that_of_the_right_machine(impedance):
+    result = so.accept(impedance, [keep_every(run(impedance, excite(20.0, 3)), 2)], link=take_link())
+    assert result.replayed and result.enclosed and result.differences.inside, result
+    assert not any(row.outcome == "refuted" for row in result.response.judged if row.limit is not None)
