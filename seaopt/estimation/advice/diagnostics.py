@@ -206,6 +206,8 @@ def _advise_on_inputs(
         if cross.p >= SIGNIFICANCE:
             continue
         lag, size = cross.worst_lag, f"({cross.worst:.2g} times the 99 % bound)"
+        if lag < 0 and output.experiment.data.feedback:
+            continue  # as it does under any law
         if lag < 0:
             sentences.append(
                 f"{output.label}: {name} follows the residual, most around lag {lag} {size}: feedback was on, or "

@@ -11,15 +11,21 @@ and a residual's coherence is compared with it. Stretches long and short are loo
 ones average more.
 
 A lightly damped mode rings longer than any stretch: there the coherence is a lower bound of what a model could explain.
+
+Under a law the inputs carry the outputs' noise, and are coherent with it at all lines where the law reads it: only
+what was commanded before tells of the plant (Ljung, System Identification, 2nd ed., sec. 16.6). There what
+the residual's own past leaves of it is regressed on the inputs' sums over lags of 1, 2, 3, 4 to 5 ... samples.
+What the inputs account for of the output is then what the model does, and what they do of the residual.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt import welch
 from seaopt.estimation.problem.chance import exceeds
@@ -36,6 +42,8 @@ TOGETHER = 16384  # samples of as many stretches as are transformed at once: the
 OUTLIER = 4.0  # robust standard deviations beyond which a residual is an outlier of its spectrum
 OCTAVES = 24  # below the Nyquist frequency, at most
 SILENT = 1e-9  # of an input's largest line
+PAST = 16  # samples of its own past that whiten a residual
+LAG_RATIO, LONGEST_LAG = 2.0**0.5, 0.125  # of the ends of the sums of an input, and the last of them over the log
 ALIKE = 1e-10  # of the power of inputs that differ by less there is nothing left to rounding
 
 
@@ -57,6 +65,11 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
     if not inputs:
         return shares
     total = sum(rows.shape[1] for rows in inputs)
+    if experiment.data.feedback:
+        rows = enumerate(experiment.data.outputs)
+        return {
+            name: _look_back(inputs, outputs, o, experiment.period) for o, name in rows if experiment.spread[o] > 0.0
+        }
     # Even, for stretches overlap by half, and without a prime factor above 5, for transforms are quick then.
     longest = (min(max(2 * total // count, SHORTEST), total) for count in STRETCHES)
     lengths = sorted({2 * find_quick_size_within(samples // 2) for samples in longest})
@@ -113,6 +126,65 @@ def _tame(error: Float[np.ndarray, "ny n"], used: Bool[np.ndarray, "ny n"]) -> F
             if scale > 0.0:
                 np.clip(row, middle - scale, middle + scale, out=row)
     return tamed
+
+
+def _look_back(
+    inputs: Sequence[Float[np.ndarray, "m _"]], outputs: Sequence[Float[np.ndarray, "s _"]], o: int, period: float
+) -> CoherentShare:
+    """Return what the inputs before each sample account for, of an output of a log that was taken under a law."""
+    ny = len(outputs[0]) // 2
+    total = sum(rows.shape[1] for rows in inputs)
+    edges = np.unique(np.floor(LAG_RATIO ** np.arange(2.0 * np.log2(max(LONGEST_LAG * total, 4.0)))).astype(int))
+    errors = [rows[ny + o] - np.mean(rows[ny + o]) for rows in outputs]
+    own = np.vstack([_list_past(error) for error in errors])
+    columns, error = np.vstack([_sum_lags(u, edges) for u in inputs]), np.concatenate(errors)
+    white, columns = error - _regress(own, error[:, None])[:, 0], columns - _regress(own, columns)
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    values, vectors = np.linalg.eigh((columns / size).T @ (columns / size))
+    seen = values > ALIKE * values[-1]
+    across = vectors[:, seen].T @ ((columns / size).T @ white)
+    count, energy = int(np.count_nonzero(seen)), max(float(white @ white), 1e-300)
+    free = max(total - own.shape[1] - count, 1)
+    r2 = min(float(np.sum(across**2 / values[seen])) / energy, 1.0 - 1e-12)
+    p = exceeds(0.5 * count, 0.5 * free * r2 / (1.0 - r2))
+    residual = max((r2 - count / total) / (1.0 - count / total), 0.0)
+    explained = (columns / size) @ (vectors[:, seen] @ (across / values[seen]))
+    power = np.abs(np.fft.rfft(explained)) ** 2
+    f = np.fft.rfftfreq(explained.size, period)[1:]
+    octave = np.floor(np.log2(f[-1] / f)).astype(int)
+    most = f[octave == int(np.argmax(np.bincount(octave, weights=power[1:])[:OCTAVES]))]
+    measured = np.concatenate([rows[o] - np.mean(rows[o]) for rows in outputs])
+    left, whole = float(error @ error), max(float(measured @ measured), 1e-300)
+    share = float(np.clip(1.0 - (1.0 - residual) * left / whole, 0.0, 1.0))
+    return CoherentShare(
+        output=share,
+        residual=residual,
+        p=p,
+        band_hz=(float(most[0]), float(most[-1])),
+        power=residual * left / max(share * whole, 1e-300),
+    )
+
+
+def _sum_lags(u: Float[np.ndarray, "m n"], edges: Int[np.ndarray, " k"]) -> Float[np.ndarray, "n c"]:
+    """Return the sums of each input over the samples before each one, from an edge to the next; ahead of the first
+    sample it is what it is on the mean.
+    """
+    before = np.cumsum(u - u.mean(axis=1, keepdims=True), axis=1)
+    before = np.hstack([np.zeros((len(u), edges[-1] + 1)), before])  # column edges[-1] + k: of all samples before k
+    n, last = u.shape[1], edges[-1]
+    parts = [before[:, last + 1 - a : last + 1 - a + n] for a in edges]
+    return np.vstack([near - far for near, far in pairwise(parts)]).T
+
+
+def _list_past(error: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+    """Return the samples before each one, and a constant."""
+    padded = np.concatenate([np.zeros(PAST), error[:-1]])
+    return np.column_stack([np.lib.stride_tricks.sliding_window_view(padded, PAST), np.ones(error.size)])
+
+
+def _regress(columns: Float[np.ndarray, "n k"], values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
+    """Return the part of values that columns make."""
+    return columns @ np.linalg.lstsq(columns.T @ columns, columns.T @ values, rcond=1e-12)[0]
 
 
 @record(eq=False)
