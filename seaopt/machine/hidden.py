@@ -45,6 +45,7 @@ from seaopt.machine.stepped import (
     leave_integrals,
     list_steps,
     play,
+    take_weights,
 )
 from seaopt.machine.ticks import find_saturated
 from seaopt.records import record
@@ -120,8 +121,7 @@ class Segments:
 
 def respond(law: RunnableLaw, f: Float[np.ndarray, " m"]) -> Complex[np.ndarray, "k m"]:
     """Return the commands of a law per reference and reading, at frequencies in cycles per row."""
-    columns = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
-    direct = np.concatenate([[law.d_reference], -np.ravel(law.d_measurement)])
+    columns, direct = take_weights(law)
     z = np.exp(2j * np.pi * f)[:, None, None]
     states = np.linalg.solve(z * np.eye(law.c.size) - law.a, np.broadcast_to(columns, (f.size, *columns.shape)))
     return law.per_effort * (direct[:, None] + np.einsum("i,mik->km", law.c, states))

@@ -299,10 +299,16 @@ class Inputs:
         """Return the commands of a law that starts from zero, and what each state at the first row adds to them."""
         n = len(self.columns)
         rows = list_powers(law.c, law.a, n)
-        weights = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
-        out = self.columns @ np.append(law.d_reference, -np.ravel(law.d_measurement)) + self.added
+        weights, direct = take_weights(law)
+        out = self.columns @ direct + self.added
         out[1:] += np.fft.irfft(np.sum(transform(rows @ weights) * self.spectra, axis=1))[: n - 1]
         return law.per_effort * out, law.per_effort * rows
+
+
+def take_weights(law: RunnableLaw) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, " k"]]:
+    """Return with which weights a law's states and its effort take the reference and the readings."""
+    weights = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
+    return weights, np.append(law.d_reference, -np.ravel(law.d_measurement))
 
 
 def transform(columns: Float[np.ndarray, "n m"]) -> Complex[np.ndarray, "f m"]:

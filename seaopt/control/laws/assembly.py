@@ -78,16 +78,19 @@ class Assembly:
     def through(self, part: TransferFunction) -> Assembly:
         """Return this in series with a stable part."""
         a, b, c, d = part.state_space()
-        into, through, chain = np.outer(b, self.d), d * self.d, np.zeros_like(self.chain)
+        into, through, chain, inner = b[:, None] * self.d, d * self.d, np.zeros_like(self.chain), np.eye(c.size) - a
         drive, direct = b, d  # of one term of the part's Taylor series after the other, first the part itself
         for order in range(len(chain)):
-            fixed = np.linalg.solve(np.eye(c.size) - a, drive)
+            fixed = np.linalg.solve(inner, drive) if c.size else b
             chain[: len(chain) - order] += (direct + float(c @ fixed)) * self.chain[order:]
             drive, direct = -a @ fixed, -float(c @ fixed)
-            into = into + np.outer(drive, self.chain[order])
+            into = into + drive[:, None] * self.chain[order]
             through = through + direct * self.chain[order]
-        whole = np.block([[self.a, np.zeros((self.c.size, c.size))], [np.outer(b, self.c), a]])
-        return Assembly(chain=chain, a=whole, b=np.vstack([self.b, into]), c=np.concatenate([d * self.c, c]), d=through)
+        n, whole = self.c.size, np.zeros((self.c.size + c.size, self.c.size + c.size))  # as in `plus`
+        whole[:n, :n], whole[n:, :n], whole[n:, n:] = self.a, b[:, None] * self.c, a
+        return Assembly(
+            chain=chain, a=whole, b=np.concatenate([self.b, into]), c=np.concatenate([d * self.c, c]), d=through
+        )
 
     def integrated(self, static: Columns) -> Assembly:
         """Return this over delta; `static` is its `static`, in which the caller may know a zero to be one."""

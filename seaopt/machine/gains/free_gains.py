@@ -23,9 +23,10 @@ from jaxtyping import Float
 
 from seaopt.control import Controller, RunnableLaw, runnable
 from seaopt.control.laws.structures import LAW_GAINS, Gains
+from seaopt.control.loops.law import Law
 from seaopt.errors import SeaoptError
 from seaopt.logs.quality.faults import find_runs
-from seaopt.machine.stepped import FLOOR, Inputs, Others, Setting, find_at_limit
+from seaopt.machine.stepped import FLOOR, Inputs, Others, Setting, find_at_limit, take_weights, transform
 from seaopt.machine.ticks import Ticks
 from seaopt.records import record
 
@@ -136,13 +137,21 @@ class _Run:
     commands: Float[np.ndarray, " n"]
     inputs: Inputs
 
-    def leave_states(self, laws: Sequence[RunnableLaw]) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-        """Return what each of the laws makes more than the first, and the logged commands less those of the first,
-        from zero, both without what a state at the first row adds.
+    def leave_states(
+        self, first: RunnableLaw, others: Sequence[Law]
+    ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+        """Return what each of other laws makes more than a first one, and the logged commands less those of the first,
+        from zero, both without what a state at the first row adds. They have the first one's time constants, and so
+        its states, which take something else of what they are given.
         """
-        first, *others = (self.inputs.respond(law) for law in laws)
-        basis = np.linalg.qr(first[1] / np.maximum(np.linalg.norm(first[1], axis=0), np.finfo(float).tiny))[0]
-        columns = np.column_stack([*(out - first[0] for out, _ in others), self.commands - first[0]])
+        commands, rows = self.inputs.respond(first)
+        weights, direct = take_weights(first)
+        more = np.stack([law.b for law in others], axis=2) - weights[:, :, None]
+        out = first.per_effort * self.inputs.columns @ (np.stack([law.d for law in others], axis=1) - direct[:, None])
+        taken = (transform(rows) @ more.reshape(len(more), -1)).reshape(-1, *more.shape[1:])
+        out[1:] += np.fft.irfft(np.einsum("fko,fk->fo", taken, self.inputs.spectra), axis=0)[: len(rows) - 1]
+        basis = np.linalg.qr(rows / np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny))[0]
+        columns = np.column_stack([out, self.commands - commands])
         columns -= basis @ (basis.T @ columns)
         return columns[:, :-1], columns[:, -1]
 
@@ -153,11 +162,16 @@ def _project(
     """Return the best gains at given time constants, and what they and the best states at the start of each run leave
     of the commands.
     """
-    own = numbers.linear
+    own, controller = numbers.linear, setting.controller
+    first = make_law(controller, numbers.make(own, times), balanced=False)(setting).linear
     # Where each gain is half as large again, of which the commands change by half of its column.
-    points = [own, *(own + 0.5 * step for step in np.diag(own))]
-    laws = [make_law(setting.controller, numbers.make(each, times), balanced=False)(setting).linear for each in points]
-    table, target = (np.concatenate(each) for each in zip(*(run.leave_states(laws) for run in runs), strict=True))
+    others = [
+        numbers.make(own + 0.5 * step, times).law(controller.spec.structure, controller.sample_time_s)
+        for step in np.diag(own)
+    ]
+    table, target = (
+        np.concatenate(each) for each in zip(*(run.leave_states(first, others) for run in runs), strict=True)
+    )
     size = np.maximum(np.linalg.norm(table, axis=0), np.finfo(float).tiny)
     solved = np.linalg.lstsq(table / size, target, rcond=1e-12)[0] / size
     return numbers.make(own * (1.0 + 0.5 * solved), times), target - table @ solved
