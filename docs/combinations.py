@@ -66,7 +66,7 @@ SCHEDULE = '[controller.schedule]\nover = "k_s"\npoints = [280, 320]'
 EXPERIMENT = """[[experiment]]
 name = "chirp"
 plant = "stand"
-virtual = { seed = 1, duration_s = 40, rate_hz = 1000, noise_std = { tau_s = 0.01 }, excitation = { chirp = { amplitude = 2.0, f0_hz = 0.1, f1_hz = 150 }, noise = { std = 1.0, band_hz = 200 } } }
+virtual = { seed = 1, duration_s = 40, rate_hz = 1000, noise_std = { tau_s = 0.01, theta_m = 1e-4 }, excitation = { chirp = { amplitude = 2.0, f0_hz = 0.1, f1_hz = 150 }, noise = { std = 1.0, band_hz = 200 } } }
 """
 OWN = {  # a PI at 1 kHz
     "sample_time_s": 1e-3, "compute_delay_samples": 1,
@@ -81,8 +81,12 @@ LAWS: Mapping[str, Mapping[str, str]] = {
     "schedule of `pid_dob`": {"STRUCTURE": f'structure = "pid_dob"\n{LIMITS}', "SCHEDULE": SCHEDULE},
     "schedule of `cascade`": {"STRUCTURE": f'structure = "cascade"\n{LIMITS}', "SCHEDULE": SCHEDULE, "MEASURED": BOTH},
     "predictive control": {"STRUCTURE": 'structure = "mpc"\nbandwidth_hz = 16'},
-    "designed on `frf:`": {
+    "`pid` designed on `frf:`": {
         "STRUCTURE": f'structure = "pid"\n{LIMITS}', "PLANT": "frf:chirp", "EXPERIMENT": EXPERIMENT, "CERTIFIED": "",
+    },
+    "`cascade` designed on `frf:`": {
+        "STRUCTURE": f'structure = "cascade"\n{LIMITS}', "MEASURED": BOTH, "PLANT": "frf:chirp", "EXPERIMENT": EXPERIMENT,
+        "CERTIFIED": "",
     },
     "a law of your own": {"STRUCTURE": f'structure = "pid"\n{LIMITS}'},
 }  # fmt: skip

@@ -67,6 +67,8 @@ class MeasuredResponse:
         Between 0 and 1.
     averages : array, shape (m,)
         Segments averaged: many short ones where the response is smooth, few long ones where it is not.
+    further : tuple of MeasuredResponse
+        Of the same log, of the other outputs that a law reads; their discs and these hold the truth together.
     values : mapping of name to float
         Of the plant's parameters and states, what is known to have been otherwise there than in the rest of the data: a
         schedule places the response by its variable here.
@@ -94,6 +96,7 @@ class MeasuredResponse:
     radius: Lines
     confidence: float
     averages: Int[np.ndarray, " m"]
+    further: tuple[MeasuredResponse, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
@@ -108,6 +111,7 @@ class MeasuredResponse:
             f"MeasuredResponse {self.name}: {self.output}/{self.source} at {self.frequency_hz.size} frequencies from "
             f"{low:.3g} to {high:.3g} Hz, {np.min(averages)} to {np.max(averages)} averages; discs of "
             f"{np.median(relative):.2%} (median) to {np.max(relative):.2%} hold the truth at {self.confidence:.4g}"
+            + "".join(f"\n{other!r}" for other in self.further)
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -125,13 +129,13 @@ class MeasuredResponse:
             "real": np.real(self.response),
             "imag": np.imag(self.response),
             "radius": self.radius,
-        }
+        } | ({"further": [other.to_dict() for other in self.further]} if self.further else {})
 
 
 def measure_response(
     plant: Plant,
     log: Log,
-    output: str,
+    output: str | Sequence[str],
     *,
     source: str | None = None,
     name: str = "log",
@@ -147,8 +151,8 @@ def measure_response(
         Its input and output names are those of the log's channels.
     log : Log
         One segment without gaps, taken in open loop.
-    output : str
-        What a controller would measure.
+    output : str or sequence of str
+        What a controller would measure; of a law that reads several outputs all of them, the regulated one first.
     source : str, optional
         The input; what a controller commands, the plant's first, if left out.
     name : str
@@ -171,7 +175,8 @@ def measure_response(
     if not 0.0 < confidence < 1.0:
         raise LogError(f"confidence = {confidence:g} is not between 0 and 1; give 0.95, say")
     source = next(iter(plant.inputs)) if source is None else source
-    check_record(log, (source, output))
+    output, *others = (output,) if isinstance(output, str) else output
+    check_record(log, (source, output, *others))
     if np.ptp(log[source]) == 0.0:
         raise LogError(f"{log.source}: {source} is constant; a frequency response needs excitation")
     moving = [rival for rival in plant.inputs if rival != source and rival in log.signals and np.ptp(log[rival]) > 0.0]
@@ -180,6 +185,12 @@ def measure_response(
             f"{log.source}: {', '.join(moving)} moves besides {source}, which counts as noise, and not as even noise; "
             f"take a log in which {source} alone is excited"
         )
+    if others:
+        each = 1.0 - (1.0 - confidence) / (1 + len(others))  # so that all together have the confidence asked
+        options: dict[str, Any] = {"source": source, "name": name, "clock": clock, "stretch_s": stretch_s}
+        first, *rest = (measure_response(plant, log, one, confidence=each, **options) for one in (output, *others))
+        rest = (replace(one, confidence=float(confidence)) for one in rest)
+        return replace(first, confidence=float(confidence), further=tuple(rest))
     chosen = Clock(period=log.period) if clock is None else clock
     lengths = [stretch_s] if stretch_s is not None else _list_windows(len(log), log.period)
     estimates = [h1(log[source], log[output], log.period, stretch_s=length) for length in lengths]

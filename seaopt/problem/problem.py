@@ -14,7 +14,7 @@ from seaopt.bench import Chirp, Excitation, Multisine, Noise, Sensors, virtual_l
 from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
 from seaopt.control.laws.delay import LoopSpec, find_drive, find_drive_delay, take_own_delays
-from seaopt.control.loops.sampled_plant import add_drive_delay, list_names
+from seaopt.control.loops.sampled_plant import add_drive_delay, find_signals
 from seaopt.errors import LogError, ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
     Experiment,
@@ -151,7 +151,7 @@ class Problem:
                 response = measure_response(
                     experiment.plant,
                     experiment.log,
-                    list_names(self.controller_table.measured)[0],
+                    find_signals(experiment.plant, self.controller_table.measured),
                     name=experiment.name,
                     confidence=self.controller_table.frf_confidence,
                     clock=Clock(

@@ -106,8 +106,8 @@ def _check_schedule(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
 
 
 def _check_responses(table: ProblemTable, controller: ControllerTable) -> None:
-    """Refuse measured responses of experiments that the file has not, or that do not measure what is regulated."""
-    experiments = {experiment.name: experiment for experiment in table.experiment}
+    """Refuse measured responses of experiments that the file has not."""
+    experiments = [experiment.name for experiment in table.experiment]
     named = [("plant", controller.plant), *(("robust_to", name) for name in controller.robust_to)]
     for field, name in named:
         if not name.startswith(RESPONSE):
@@ -115,12 +115,6 @@ def _check_responses(table: ProblemTable, controller: ControllerTable) -> None:
         key, source = f'controller.{field} = "{name}"', name.removeprefix(RESPONSE)
         if source not in experiments:
             raise ProblemError(f"{key} is of no [[experiment]] of this file; {suggestion(source, experiments)}")
-        experiment = experiments[source]
-        if experiment.virtual is None and controller.measured not in experiment.outputs:
-            raise ProblemError(
-                f"{key} is of an experiment that does not measure {controller.measured}; name its column in "
-                f"experiment.{source}.outputs"
-            )
 
 
 def _check_expected(
@@ -167,8 +161,9 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
     named: list[str] = [controller.plant, *controller.robust_to]
     named += table.robustness.plants if table.robustness else []
     named += [table.impedance.plant] if table.impedance else []
-    on_bench = {f"{RESPONSE}{experiment.name}": experiment.plant for experiment in table.experiment}
-    for name in [on_bench.get(name, name) for name in named]:
+    on_bench = {f"{RESPONSE}{experiment.name}": experiment for experiment in table.experiment}
+    for key in named:
+        name = on_bench[key].plant if key in on_bench else key
         plant = plants[name]
         if measured not in plant.outputs:
             stated = "" if "measured" in controller.model_fields_set else ", which is left out,"
@@ -178,9 +173,16 @@ def _check_measured(table: ProblemTable, plants: Mapping[str, Plant]) -> None:
                 f'{", ".join(outputs)}; write measured = "{_nearest(measured, outputs)}" in [controller]'
             )
         try:
-            find_signals(plant, tuple(signals))
+            reads = find_signals(plant, (measured, *signals))
         except ControlError as error:
             raise ProblemError(f"controller.{error}") from error
+        if key in on_bench and on_bench[key].virtual is None:
+            missing = [name for name in reads if name not in on_bench[key].outputs]
+            if missing:
+                raise ProblemError(
+                    f"controller names {key}, an experiment that does not measure {join_words(missing)}, which the law "
+                    f"reads; name the column in experiment.{on_bench[key].name}.outputs"
+                )
 
 
 def _check_link(table: ProblemTable, plants: Mapping[str, Plant]) -> None:

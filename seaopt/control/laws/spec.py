@@ -25,7 +25,7 @@ from seaopt.control.laws.structures import (
 )
 from seaopt.control.loops.compensation.link_feedforward import LOWEST_HZ, LinkFeedforward
 from seaopt.control.loops.measured.plant import MeasuredPlant, sample_measured
-from seaopt.control.loops.sampled_plant import Measured, list_names
+from seaopt.control.loops.sampled_plant import Measured, find_signals, list_names
 from seaopt.errors import ControlError, suggestion
 from seaopt.formatting import join_words
 from seaopt.frequency import MeasuredResponse
@@ -247,29 +247,32 @@ class ControllerSpec(LoopSpec):
     def see_response(self, measured: MeasuredResponse, command: Command) -> MeasuredPlant:
         """Return what a controller of this specification, which gives a command, sees of a measured response.
 
-        Raises ControlError: the law reads several outputs, or the motion of a link that the response's plant does not
-        hold; the response is of another output or input; or as `sample_measured`.
+        Raises ControlError: the response is not of all outputs that the law reads, or of another one or input; the law
+        reads the motion of a link that the response's plant does not hold; or as `sample_measured`.
         """
-        if not isinstance(self.measured, str):
-            raise ControlError(
-                f"frf:{measured.name}: is of {measured.output} alone, and the law reads {join_words(self.measured)}, "
-                f'whose responses are needed together; give models of the plants, or measured = "{self.regulated}" and '
-                'structure = "pid"'
-            )
+        outputs = {each.output: each for each in (measured, *measured.further)}
+        reads = find_signals(measured.plant, self.measured)
         if self.link_feedforward is not None and measured.plant.moves:
             raise ControlError(
-                f"frf:{measured.name}: is of {measured.output} alone, and of a plant whose link moves, which "
+                f"frf:{measured.name}: is of {join_words([*outputs])} alone, and of a plant whose link moves, which "
                 "link_feedforward reads; give a model of that plant, and responses of one that holds its link"
             )
-        ends = (("output", measured.output, self.measured), ("input", measured.source, command.input))
+        missing = [name for name in reads[1:] if name not in outputs]
+        if missing:
+            raise ControlError(
+                f"frf:{measured.name}: is of {join_words([*outputs])} alone, and the law reads {join_words(reads)}, "
+                f"whose responses are needed together, of one log: have {join_words(missing)} in it, or give a model "
+                "of that plant"
+            )
+        ends = (("output", measured.output, self.regulated), ("input", measured.source, command.input))
         for end, measured_at, used in ends:
             if measured_at != used:
                 raise ControlError(
                     f"frf:{measured.name}: is measured at the {end} {measured_at}, and the controller's is {used}; "
                     "measure that"
                 )
-        waits = count_response_samples(self, measured)
-        return sample_measured(measured, command.per_effort, self.sample_time_s, waits)
+        waits, of_reads = count_response_samples(self, measured), [outputs[name] for name in reads]
+        return sample_measured(of_reads, command.per_effort, self.sample_time_s, waits)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields, as in a problem file."""

@@ -12,7 +12,7 @@ from seaopt.control.laws.delay import LoopSpec
 from seaopt.control.laws.limits import BY_NAME, LIFTABLE, OTHER_NOISE, Limit, MeasuredLoop, Scope, Sense
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.loop import Loop
-from seaopt.control.loops.measured.loop import DiscLoop, bound_disc
+from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.errors import ControlError
 from seaopt.formatting import format_count, join_words
 from seaopt.records import record
@@ -260,11 +260,12 @@ def _reached(spec: LoopSpec, verdict: LimitVerdict, loop: Loop | DiscLoop) -> st
     assert curve is not None and curve.until_hz is not None
     until, grid = curve.until_hz(verdict.allowed, spec.bandwidth_hz), loop.grid()
     f = np.append(grid[grid < until], until)
-    p, c_r, c_y = loop.plant.response(f), loop.law.reference_response(f), loop.law.measurement_response(f)
-    open_loop = loop.open_loop(f)
-    values = np.abs(curve.numerator(p, c_y, c_r, open_loop)) / np.abs(1.0 + open_loop)
     if isinstance(loop, DiscLoop):
-        least, most = bound_disc(curve.of, p, loop.plant.discs(f), c_y, c_r)
+        ((least, most),) = loop.bound(f, curve.of)
         values = least if curve.floor else most
+    else:
+        p, c_r, c_y = loop.plant.response(f), loop.law.reference_response(f), loop.law.measurement_response(f)
+        open_loop = loop.open_loop(f)
+        values = np.abs(curve.numerator(p, c_y, c_r, open_loop)) / np.abs(1.0 + open_loop)
     extreme = f"falls to {np.min(values):.4f}" if curve.floor else f"reaches {np.max(values):.4f}"
     return f"{curve.symbol} {extreme} below {until:.4g} Hz, {curve.level(verdict.allowed):.4f} allowed"

@@ -133,11 +133,10 @@ def _differentiate_size(value: ComplexN, by: Complex[np.ndarray, "g n"]) -> Valu
 def _linearise_limits(task: Task, grid: Grid, law: _Affine) -> list[Rows]:
     """Return rows value + slope dtheta - slack <= 1 at the frequencies and plants where the limits matter."""
     rows, usage = list[Rows](), task.usage(grid, law.law)
-    measured = bool(np.any(grid.discs))
     for name in grid.levels:
         index = choose_near(usage[name])
         used, near_limit = usage[name].ravel()[index], CURVES[name].of == "1"  # the limit is on abs(1 + L) itself
-        if measured:
+        if grid.in_discs:
             slope = _differentiate_usage(grid, law, name, index)
             rows.append((2.0 - 1.0 / used, slope / used[:, None] ** 2) if near_limit else (used, slope))
             continue
@@ -204,17 +203,18 @@ def choose_near(usage: Usage) -> Indices:
 def _differentiate_usage(grid: Grid, law: _Affine, name: str, index: Indices) -> PointSlopes:
     """Return the derivative of a limit's usage by the gains at points in discs, by central differences."""
     curve, (row, column) = CURVES[name], np.divmod(index, grid.f.size)
-    path, discs = _take_path(grid, name).at((row, column)), grid.discs[row, column]
-    p, level, c_v = path.y, grid.levels[name][column], law.law.c_v[column]
+    path, discs = _take_path(grid, name).at((row, column)), grid.discs.at((row, column))
+    level, now = grid.levels[name][column], [part[column] for part in (law.law.c_y, law.law.c_r, law.law.c_v)]
     slope = np.zeros((index.size, len(law.by_y)))
     for k in range(len(law.by_y)):
-        by_y, by_r = law.by_y[k, column], law.by_r[k, column]
-        size = np.maximum(np.abs(by_y), np.abs(by_r))
-        step = STEP * np.maximum(np.abs(law.law.c_y[column]), 1e-9) / np.maximum(size, 1e-300)
+        by = [part[k, column] for part in (law.by_y, law.by_r, law.by_v)]
+        moved = now[2] if np.any(by[2]) else now[0]
+        size = np.max(np.abs(by), axis=0)
+        step = STEP * np.maximum(np.abs(moved), 1e-9) / np.maximum(size, 1e-300)
         ends: list[Float[np.ndarray, " c"]] = []
         for sign in (1.0, -1.0):
-            c_y, c_r = (c[column] + sign * step * by for c, by in ((law.law.c_y, by_y), (law.law.c_r, by_r)))
-            ends.append(use_disc(curve, level, p, discs, c_y, c_r, path.add_constant(c_v, c_r)))
+            law_there = (c + sign * step * change for c, change in zip(now, by, strict=True))
+            ends.append(use_disc(curve, level, path, discs, *law_there))
         slope[:, k] = (ends[0] - ends[1]) / (2.0 * step)
     return slope
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float, Inexact, Int
 
 from seaopt.control.laws.limits import LimitCurve
 from seaopt.control.laws.spec import ControllerSpec
@@ -15,8 +15,6 @@ from seaopt.control.laws.structures import SpeedLoop
 from seaopt.control.loops.absolute_stability import LOWEST_ANGLE, limit_feedback
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.control.loops.measured.loop import bound_disc
-from seaopt.control.loops.measured.plant import MeasuredPlant
-from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
 from seaopt.plants import Plant
 from seaopt.plants.friction import Friction
@@ -37,12 +35,12 @@ LEAST_RESPONSE = 1e-6  # of what is to be above a level: discs around zero have 
 @record(eq=False)
 class Path:
     """A sum over the signals that a law reads, affine in it: fixed + y C_y + v C_v + r C_r, C_v of a speed loop, and r
-    what an outer loop takes off the reference; None where no outer loop is closed.
+    what an outer loop takes off the reference; None where no outer loop is closed. Or the radii around these.
     """
 
-    fixed: ComplexArray
-    y: ComplexArray
-    v: ComplexArray
+    fixed: Inexact[np.ndarray, "..."]
+    y: Inexact[np.ndarray, "..."]
+    v: Inexact[np.ndarray, "..."]
     r: ComplexArray | None = None
 
     def add_constant(self, c_v: ComplexArray, c_r: ComplexArray) -> ComplexArray:
@@ -78,14 +76,16 @@ def stack_paths(paths: Sequence[Path]) -> Path:
 
 
 def feed_back(
-    signals: Complex[np.ndarray, "... y m"],
+    signals: Inexact[np.ndarray, "... y m"],
     start: float,
     further: Sequence[TransferFunction | SpeedLoop],
     f: Frequencies,
     ts: float,
+    *,
+    sizes: bool = False,
 ) -> Path:
     """Return a number and a weighted sum over the signals fed back, of one row per signal: the regulated one, and those
-    that further paths feed back.
+    that further paths feed back; of radii their `sizes`.
     """
     y = signals[..., 0, :]
     v = np.zeros_like(y)
@@ -94,7 +94,8 @@ def feed_back(
         if isinstance(path, SpeedLoop):
             v = signals[..., row, :]
         else:
-            fixed = fixed + signals[..., row, :] * path.response(f, ts)
+            filtered = path.response(f, ts)
+            fixed = fixed + signals[..., row, :] * (np.abs(filtered) if sizes else filtered)
     return Path(fixed=fixed, y=y, v=v)
 
 
@@ -106,7 +107,7 @@ class Grid:
     q: Response  # exp(-j omega T_s)
     # shape (plants, m): the command per effort asked, 1 + L, with P as y; the first is the design plant
     plants: Path
-    discs: Float[np.ndarray, "n m"]  # radii around the plants that are measured; zeros of models
+    discs: Path  # radii of the discs around the plants that are measured; zeros of models
     rows: tuple[int, ...]  # which of the task's plants they are
     kept: Response  # kept, inverse: the nominal plant's parts; zeros without an observer
     inverse: Response
@@ -125,12 +126,17 @@ class Grid:
         """Whether the loop has a path besides that of the regulated signal."""
         return bool(np.any(self.plants.v) or np.any(self.plants.fixed != 1.0))
 
+    @property
+    def in_discs(self) -> bool:
+        """Whether a plant is measured."""
+        return bool(np.any(self.discs.y))
+
     def at(self, index: Int[np.ndarray, " k"]) -> Grid:
         """Return some of the frequencies."""
-        paths = ("plants", "port", "force", "friction", "friction_size")
+        paths = ("plants", "discs", "port", "force", "friction", "friction_size")
         return replace(
             self,
-            **{name: getattr(self, name)[..., index] for name in ("f", "q", "discs", "kept", "inverse", "unit")},
+            **{name: getattr(self, name)[..., index] for name in ("f", "q", "kept", "inverse", "unit")},
             **{name: getattr(self, name).at((..., index)) for name in paths},
             levels={name: level[index] for name, level in self.levels.items()},
         )
@@ -148,14 +154,15 @@ class LawResponse:
 def use_disc(
     curve: LimitCurve,
     level: Float[np.ndarray, "..."],
-    p: ComplexArray,
-    discs: Float[np.ndarray, "..."],
+    path: Path,
+    discs: Path,
     c_y: ComplexArray,
     c_r: ComplexArray,
-    constant: ComplexArray,
+    c_v: ComplexArray,
 ) -> Float[np.ndarray, "..."]:
     """Return the usage of a limit by the worst of the responses in discs."""
-    least, most = bound_disc(curve.of, p, discs, c_y, c_r, constant)
+    reach = discs.fixed + discs.v * np.abs(c_v)
+    least, most = bound_disc(curve.of, path.y, discs.y, c_y, c_r, path.add_constant(c_v, c_r), reach, c_v)
     return level / np.maximum(least, LEAST_RESPONSE) if curve.floor else most / level
 
 
@@ -167,11 +174,6 @@ def use_friction(grid: Grid, law: LawResponse) -> dict[str, np.ndarray]:
     c_r = law.c_r[..., None, :]
     size = np.linalg.norm(grid.friction_size.add_up(c_y[..., None, :], c_v[..., None, :], c_r[..., None, :]), axis=-2)
     return {FRICTION: size / np.maximum(np.abs(grid.friction.add_up(c_y, c_v, c_r)), 1e-300)}
-
-
-def measured_discs(plant: DigitalPlant | MeasuredPlant, f: Frequencies) -> Curve:
-    """Return the radii of the discs around a plant's responses; zeros of a model."""
-    return plant.discs(f) if isinstance(plant, MeasuredPlant) else np.zeros(f.size)
 
 
 @record(eq=False)

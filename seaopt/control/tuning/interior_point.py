@@ -220,7 +220,7 @@ def _build_program(
             "scale": 14,
             "linear": LINEAR_LIMITS * gains,
             "unit": 2 * POINTS_PER_LIMIT * passive,
-            "discs": n * discs,
+            "discs": 3 * n * discs,
         }
         | {f"top_{name}_{part}": tops for name in ("fixed", "y", "v") for part in ("re", "im")}
     )
@@ -254,6 +254,7 @@ def _build_program(
     names = [f"{name}_{part}" for name in complex_data for part in ("re", "im")]
     p, c_y, c_r, c_v, open_loop = law({name: data[name][:n] for name in names})
     squared = (open_loop + 1.0).square() + SMOOTHING
+    radii = ca.vertsplit(data["discs"], n) if discs else []
     slices = {kind: slice(POINTS_PER_LIMIT * i, POINTS_PER_LIMIT * (i + 1)) for i, kind in enumerate(kinds)}
 
     def add_up(number: int, where: slice) -> _Complex:
@@ -277,7 +278,7 @@ def _build_program(
         else:
             curve = CURVES[kind]
             if discs:
-                size = _bound_disc(curve, p, open_loop, data["discs"], c_y, c_r)[where]
+                size = _bound_disc(curve, p, open_loop, radii, c_y, c_r, c_v)[where]
             else:
                 value = curve.numerator(p, c_y, c_r, open_loop, c_v)
                 top = value.square()[where] if isinstance(value, _Complex) else value
@@ -309,14 +310,27 @@ def _build_program(
     return ca.nlpsol("polish", "ipopt", nlp, options)
 
 
-def _bound_disc(curve: LimitCurve, p: _Complex, open_loop: _Complex, r: Any, c_y: _Complex, c_r: _Complex) -> Any:
-    """Return the logarithm of the largest (of a floor the least) X/(1 + L) of discs, as `bound_disc` has it."""
-    size, reach = (open_loop + 1.0).square() + SMOOTHING, r * _size(c_y)
+def _bound_disc(
+    curve: LimitCurve,
+    p: _Complex,
+    open_loop: _Complex,
+    radii: Sequence[Any],
+    c_y: _Complex,
+    c_r: _Complex,
+    c_v: _Complex,
+) -> Any:
+    """Return the logarithm of the largest (of a floor the least) X/(1 + L) of discs, as `bound_disc` has it. `radii`
+    are those around P, around what the law reads at fixed gains, and around a speed.
+    """
+    r, fixed, speed = radii
+    constant_radius = fixed + speed * _size(c_v)
+    size, reach = (open_loop + 1.0).square() + SMOOTHING, r * _size(c_y) + constant_radius
     room = size * leave_positive(1.0 - reach * reach / size, ca.fmin, ca.fmax)
-    centre, radius = map_disc(curve.of, p, r, c_y, c_r, open_loop, _size)
+    centre, radius, rooms = map_disc(curve.of, p, r, c_y, c_r, open_loop, constant_radius, c_v, room, _size)
     far = _size(centre)
-    top = far * leave_positive(1.0 - radius / far, ca.fmin, ca.fmax) if curve.floor else far + radius
-    return ca.log(top / room)
+    if curve.floor:
+        return ca.log(far * leave_positive(1.0 - radius / far, ca.fmin, ca.fmax) / rooms[0])
+    return ca.log((far + radius) / rooms[1])
 
 
 def _size(value: _Complex) -> Any:
@@ -334,7 +348,7 @@ def _solve(
     bottoms = [grid.plants.at((row, column))]
     if bottoms[0].r is not None:  # what is asked of the design plant is asked of the force law alone
         bottoms[0].r[np.repeat([kind in SCOPES["design plant"] for kind in kinds], POINTS_PER_LIMIT)] = 0.0
-    radii, unit = grid.discs[row, column], np.zeros(0, dtype=complex)
+    discs, unit = grid.discs.at((row, column)), np.zeros(0, dtype=complex)
     levels = [grid.levels[kind][chosen[kind] % m] for kind in kinds]
     if passive:
         at_port = chosen[PASSIVE]
@@ -350,7 +364,8 @@ def _solve(
         bottoms.append(grid.friction.at((row, column)))
         tops += [grid.friction_size.at((row, k, column)) for k in range(grid.friction_size.y.shape[1])]
     size = sum(part.size for part in columns)
-    radii = np.concatenate([radii, np.zeros(size - radii.size)]) if np.any(grid.discs) else np.zeros(0)
+    parts = (discs.y, discs.fixed, discs.v) if grid.in_discs else ()
+    radii = np.concatenate([np.zeros(0), *(np.pad(part, (0, size - part.size)) for part in parts)])
     weights, law = np.zeros(0), task.respond(grid, start)
     if not noise:
         inside = np.flatnonzero(task.weights(grid.f) > 0.0)

@@ -83,7 +83,6 @@ from seaopt.control.tuning.grid import (
     Response,
     Usage,
     feed_back,
-    measured_discs,
     stack_paths,
     use_disc,
     use_friction,
@@ -360,7 +359,7 @@ class Task:
             inverse = self.nominal.inverse_response(f, self.spec.sample_time_s)
         rows = tuple(range(len(self.plants)) if rows is None else rows)
         paths = [self._respond(row, f) for row in rows]
-        discs = np.array([measured_discs(self.plants[row], f) for row in rows])
+        discs = [self._surround(row, f) for row in rows]
         unit = np.zeros(f.size, dtype=complex)
         count, feed = 1 + len(self.further), partial(feed_back, further=self.further, f=f, ts=self.spec.sample_time_s)
         loops, forces = np.zeros((2, count, f.size), dtype=complex)
@@ -378,7 +377,7 @@ class Task:
             f=f,
             q=q,
             plants=stack_paths(paths),
-            discs=discs,
+            discs=stack_paths(discs),
             rows=rows,
             kept=kept,
             inverse=inverse,
@@ -392,12 +391,16 @@ class Task:
 
     def _respond(self, row: int, f: Frequencies) -> Path:
         """Return 1 + L of one plant, the speed of a speed loop as it is read."""
-        plant, moved = self.plants[row], self.moved
-        if not self.further or isinstance(plant, MeasuredPlant):  # whose link is held: what is read besides is zero
-            path = Path(fixed=np.ones(f.size, dtype=complex), y=plant.response(f), v=np.zeros(f.size, dtype=complex))
-        else:
-            path = feed_back(plant.responses(f), 1.0, self.further, f, self.spec.sample_time_s)
+        plant, moved, signals = self.plants[row], self.moved, 1 + len(self.further)
+        read = plant.responses(f, signals) if isinstance(plant, MeasuredPlant) else plant.responses(f)[:signals]
+        path = feed_back(read, 1.0, self.further, f, self.spec.sample_time_s)
         return path if moved is None else replace(path, r=moved.respond(row, f))
+
+    def _surround(self, row: int, f: Frequencies) -> Path:
+        """Return the radii of the discs around what `_respond` has of one plant; zeros of a model."""
+        plant, signals = self.plants[row], 1 + len(self.further)
+        radii = plant.discs(f, signals) if isinstance(plant, MeasuredPlant) else np.zeros((signals, f.size))
+        return feed_back(radii, 0.0, self.further, f, self.spec.sample_time_s, sizes=True)
 
     def terms(self, grid: Grid, x: LawsNumbers) -> LawTerms:
         """Return the law's terms on a grid."""
@@ -454,15 +457,15 @@ class Task:
         self, names: Sequence[str], grid: Grid, path: Path, plants: int | slice, law: LawResponse
     ) -> dict[str, np.ndarray]:
         """Return the usage of limits on plants with one path."""
-        discs, p, constant = grid.discs[plants], path.y, path.add_constant(law.c_v, law.c_r)
-        open_loop = constant - 1.0 + p * law.c_y
+        discs, p = grid.discs.at(plants), path.y
+        open_loop = path.add_constant(law.c_v, law.c_r) - 1.0 + p * law.c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
-        measured = bool(np.any(discs))
+        measured = bool(np.any(discs.y))
         for name in names:
             curve, level = CURVES[name], grid.levels[name]
             if measured:
-                out[name] = use_disc(curve, level, p, discs, law.c_y, law.c_r, constant)
+                out[name] = use_disc(curve, level, path, discs, law.c_y, law.c_r, law.c_v)
                 continue
             size = np.abs(curve.numerator(p, law.c_y, law.c_r, open_loop, law.c_v))
             out[name] = level * distance / np.maximum(size, 1e-12) if curve.floor else size / (level * distance)

@@ -139,7 +139,7 @@ def thin_grid(task: Task, grid: Grid, plants: Sequence[int] = range(SCANNED_PLAN
     index = np.unique(np.clip(np.concatenate([even, near]), 0, grid.f.size - 1))
     coarse = grid.at(index)
     return replace(
-        coarse, plants=coarse.plants.at(some), discs=coarse.discs[some], rows=tuple(coarse.rows[k] for k in some)
+        coarse, plants=coarse.plants.at(some), discs=coarse.discs.at(some), rows=tuple(coarse.rows[k] for k in some)
     )
 
 

@@ -113,8 +113,45 @@ def test_the_discs_hold_the_truth_as_often_as_stated():
     assert held >= 30
 
 
+@pytest.mark.parametrize("of", [*X, "C_v"])
+def test_the_extremes_over_two_discs_hold_those_of_many_responses_in_them(of):
+    """Of what is read besides, too: of all but the tracking exact, of that a bound that is not far off."""
+    rng = np.random.default_rng(2)
+    p, other, c, c_v, c_r = (rng.normal(size=30) + 1j * rng.normal(size=30) for _ in range(5))
+    whole = np.abs(1.0 + p * c + other * c_v)
+    r, r_other = 0.2 * whole / np.abs(c), 0.15 * rng.uniform(size=30) * whole / np.abs(c_v)
+    least, most = bound_disc(of, p, r, c, c_r, 1.0 + other * c_v, r_other * np.abs(c_v), c_v)
+    at = np.exp(2j * np.pi * np.linspace(0.0, 1.0, 361))
+    first, second = (p + r * at[:, None])[:, None], (other + r_other * at[:, None])[None]
+    loop = first * c + second * c_v
+    sizes = np.abs({
+        "1": 1.0, "L": loop, "1 - L": 1.0 - loop, "C_y": c, "C_v": c_v, "P C_r": first * c_r
+    }[of] / (1.0 + loop))  # fmt: skip
+    high, low = np.max(sizes, axis=(0, 1)), np.min(sizes, axis=(0, 1))
+    rounding, far = (1e-3, 1.35) if of == "P C_r" else (1e-3, 1.001)
+    assert np.all(high <= most * (1.0 + rounding)) and np.all(most <= far * high)
+    assert np.all(least <= low * (1.0 + rounding) + 1e-9)
+    holds_zero = least == 0.0
+    assert np.all(low[~holds_zero] <= (1.6 if of == "P C_r" else 1.01) * least[~holds_zero] + 1e-3)
+
+
+@pytest.mark.parametrize("negative", [1.0, -1.0])
+def test_below_the_band_a_speed_is_that_of_a_position_at_rest(negative):
+    """A speed that is the rate of F1. At the lowest point the true size is 1.04e-3 above that at rest."""
+    own = replace(exact(1e-3), output="qd", plant=STAND)
+    f = own.frequency_hz
+    rate = negative * 2j * np.pi * own.response * f
+    (output,) = sample_measured([replace(own, response=rate)], 1.0 / PER_AMPERE, 1e-3, 1).outputs
+    slow = np.geomspace(1e-3, 0.29, 40)
+    truth = negative * 2j * np.pi * slow * respond(slow, 1e-3, late=1)
+    assert output.is_speed and output.static_gain == 0.0
+    assert np.max(np.abs(output.response(slow) / truth - 1.0)) < 1.1e-3
+    with pytest.raises(ControlError, match="excite lower frequencies"):
+        sample_measured([replace(own, output="F1", response=rate)], 1.0, 1e-3, 1)
+
+
 def test_at_the_same_rate_a_log_is_what_the_controller_sees():
-    plant = sample_measured(exact(1e-3), 1.0 / PER_AMPERE, 1e-3, 2)
+    (plant,) = sample_measured([exact(1e-3)], 1.0 / PER_AMPERE, 1e-3, 2).outputs
     assert np.allclose(plant.centre, respond(plant.f, 1e-3, late=2), rtol=1e-12)
     assert np.all(plant.radius == 0.0)
 
@@ -122,7 +159,7 @@ def test_at_the_same_rate_a_log_is_what_the_controller_sees():
 @pytest.mark.parametrize("hold", ["zero", "first"])
 @pytest.mark.parametrize("period", [2.5e-3, 0.5e-3, 0.7e-3])
 def test_at_another_rate_or_hold_the_discs_hold_what_the_controller_sees(period, hold):
-    plant = sample_measured(exact(period, hold=hold), 1.0 / PER_AMPERE, 1e-3, 1)
+    (plant,) = sample_measured([exact(period, hold=hold)], 1.0 / PER_AMPERE, 1e-3, 1).outputs
     truth = respond(plant.f, 1e-3, late=1)
     assert np.all(np.abs(plant.centre - truth) <= plant.radius + 1e-9)
     slow = plant.f < 30.0
@@ -130,14 +167,14 @@ def test_at_another_rate_or_hold_the_discs_hold_what_the_controller_sees(period,
 
 
 def test_above_the_band_the_discs_hold_a_plant_that_falls():
-    plant = sample_measured(exact(1e-3, high=60.0), 1.0 / PER_AMPERE, 1e-3, 1)
+    (plant,) = sample_measured([exact(1e-3, high=60.0)], 1.0 / PER_AMPERE, 1e-3, 1).outputs
     f = np.linspace(plant.f[-1] + 0.01, 499.0, 500)
     assert np.all(plant.response(f) == 0.0)
     assert np.all(np.abs(respond(f, 1e-3, late=1)) <= plant.discs(f))
 
 
 def test_a_delay_that_is_in_the_log_is_not_added_again():
-    plant = sample_measured(exact(1e-3, delay_s=1e-3), 1.0 / PER_AMPERE, 1e-3, 2)
+    (plant,) = sample_measured([exact(1e-3, delay_s=1e-3)], 1.0 / PER_AMPERE, 1e-3, 2).outputs
     assert np.allclose(plant.centre, respond(plant.f, 1e-3, late=3), rtol=1e-9)
     older = so.ControllerSpec(delay_samples=1)
     assert count_response_samples(older, exact(1e-3, delay_s=4e-4)) == pytest.approx(0.6)
@@ -147,11 +184,11 @@ def test_a_delay_that_is_in_the_log_is_not_added_again():
 
 def test_a_response_that_has_not_come_to_rest_is_refused():
     with pytest.raises(ControlError, match="excite lower frequencies"):
-        sample_measured(exact(1e-3, low=6.0), 1.0, 1e-3, 1)
+        sample_measured([exact(1e-3, low=6.0)], 1.0, 1e-3, 1)
 
 
 def test_stability_is_that_of_the_eigenvalues():
-    plant = sample_measured(exact(1e-3, relative=1e-3), 1.0 / PER_AMPERE, 1e-3, 1)
+    plant = sample_measured([exact(1e-3, relative=1e-3)], 1.0 / PER_AMPERE, 1e-3, 1)
     model = so.tune(STAND, THOR, so.ControllerSpec(bandwidth_hz=30)).plant(STAND, THOR)
     rng, found = np.random.default_rng(3), []
     for _ in range(60):

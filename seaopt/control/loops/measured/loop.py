@@ -1,19 +1,26 @@
 r"""The loop of a law and a measured plant: the worst that any response in its discs does, and whether it is stable.
 
-With P in the disc of centre :math:`P_0` and radius r, :math:`a = 1 + L_0`, :math:`\rho = r |C_y|` and
-:math:`D = |a|^2 - \rho^2 > 0`, every figure is a Moebius map of P, whose image is again a disc:
+With P in the disc of centre :math:`P_0` and radius r, what the law reads besides in a disc of centre b - 1 and radius
+:math:`\rho_b` (:math:`\sum_i P_i C_i`, of the centres, and :math:`\sum_i r_i |C_i|`; b = 1 where it reads nothing
+else), :math:`1 + L = b + P C_y` of the centres a, :math:`\rho = r |C_y| + \rho_b` and :math:`D = |a|^2 - \rho^2 > 0`,
+every figure but the last is a Moebius map of L, whose image is again a disc:
 
-.. math:: \frac{X}{1 + P C_y} \in \frac{1}{D}\Big(X_0 \bar a + s,\; R\Big), \qquad
-    \begin{array}{c|ccccc} X & 1 & L & 1 - L & C_y & P C_r \\ \hline
-    s & 0 & -\rho^2 & \rho^2 & 0 & -r^2 C_r \bar C_y \\ R & \rho & \rho & 2\rho & \rho |C_y| & r |C_r| \end{array}
+.. math:: \frac{X}{1 + L} \in \frac{1}{D}\Big(X_0 \bar a + s,\; R\Big), \qquad
+    \begin{array}{c|cccccc} X & 1 & L & 1 - L & C_y & C_v & P C_r \\ \hline
+    s & 0 & -\rho^2 & \rho^2 & 0 & 0 & -r^2 C_r \bar C_y \\
+    R & \rho & \rho & 2\rho & \rho |C_y| & \rho |C_v| & r |C_r b| \end{array}
 
-so that the largest and the least are exact. Where :math:`D \le 0` some response in the disc makes a pole on the circle.
+so that the largest and the least are exact. The last is one of P, with :math:`r |C_y|` for :math:`\rho`; of all the
+values of b it is at most :math:`(|a| - r |C_y|)/(|a| - \rho)` times the largest, and at least
+:math:`(|a| - r |C_y|)/(|a| - r |C_y| + \rho_b)` times the least. Where :math:`D \le 0` some response in the discs makes
+a pole on the circle.
 
 **Stability** cannot be told from points alone. With a stable plant, a law with m poles at 1 and none outside, and no
-disc that reaches -1/C_y at any frequency, it can: every response in the discs turns 1 + L as often as the centres do,
-and the loop is stable if and only if that is :math:`m \pi/2` from 0 Hz to the Nyquist frequency (Nyquist; as the
-condition on measured data: Karimi, Kammer, Automatica 85, 2017, theorem 1, with C = 0 as the stabilising law that is
-known). Between, below and above the points it holds under the assumptions of `seaopt.control.loops.measured.plant`.
+discs in which 1 + L reaches zero at any frequency, it can: every response in the discs turns 1 + L as often as the
+centres do, and the loop is stable if and only if that is :math:`m \pi/2` from 0 Hz to the Nyquist frequency (Nyquist;
+as the condition on measured data: Karimi, Kammer, Automatica 85, 2017, theorem 1, with C = 0 as the stabilising law
+that is known). Between, below and above the points it holds under the assumptions of
+`seaopt.control.loops.measured.plant`.
 """
 
 from __future__ import annotations
@@ -50,14 +57,15 @@ def leave_positive(left: Any, least: Any = np.minimum, most: Any = np.maximum) -
 
 @record(eq=False)
 class DiscLoop:
-    """A measured plant closed by a law; what this reads besides the regulated output, such as a held link, is zero."""
+    """A measured plant closed by a law; what this reads besides the outputs, such as a held link, is zero."""
 
     plant: MeasuredPlant
     law: Law
 
     def open_loop(self, f: Frequencies) -> Response:
         """Return L of the centres."""
-        return self.plant.response(f) * self.law.measurement_response(f)
+        back = self.law.feedback_responses(f)
+        return np.sum(self.plant.responses(f, len(back)) * back, axis=0)
 
     def sensitivity(self, f: Frequencies) -> Response:
         """Return S of the centres."""
@@ -66,6 +74,16 @@ class DiscLoop:
     def tracking(self, f: Frequencies) -> Response:
         """Return F/F_ref of the centres."""
         return self.plant.response(f) * self.law.reference_response(f) * self.sensitivity(f)
+
+    def bound(self, f: Frequencies, *names: str, signal: int = 0) -> list[tuple[Frequencies, Frequencies]]:
+        """Return the least and the largest abs(X)/abs(1 + L) of the responses in the discs, for each X by its name; of
+        C_v the filter of one signal.
+        """
+        reference, *negative = self.law.responses(f)
+        back = -np.array(negative)
+        p, r = self.plant.responses(f, len(back)), self.plant.discs(f, len(back))
+        constant, reach = 1.0 + np.sum(p[1:] * back[1:], axis=0), np.sum(r[1:] * np.abs(back[1:]), axis=0)
+        return [bound_disc(of, p[0], r[0], back[0], reference, constant, reach, back[signal]) for of in names]
 
     def grid(self) -> Frequencies:
         """Return frequencies up to the Nyquist frequency: the measured ones, some between, and the law's own."""
@@ -79,7 +97,9 @@ class DiscLoop:
     def is_stable(self) -> bool:
         """Tell whether the loop is stable with every response in the discs, under the assumptions of the module."""
         f = self.grid()
-        if np.any(np.abs(1.0 + self.open_loop(f)) <= self.plant.discs(f) * np.abs(self.law.measurement_response(f))):
+        back = self.law.feedback_responses(f)
+        reach = np.sum(self.plant.discs(f, len(back)) * np.abs(back), axis=0)
+        if np.any(np.abs(1.0 + self.open_loop(f)) <= reach):
             return False
         if np.any(np.abs(self.law.poles[self.law.integrators :]) >= 1.0):
             return False  # a law that grows by itself is not counted here
@@ -97,9 +117,8 @@ class DiscLoop:
         if not self.is_stable():
             return LoopFigures(stable=False, spectral_radius=np.inf)
         f = self.grid()
-        p, r = self.plant.response(f), self.plant.discs(f)
-        reference, negative = self.law.responses(f)[:2]
-        sizes = {name: bound_disc(name, p, r, -negative, reference) for name in ("1", "L", "1 - L", "C_y", "P C_r")}
+        names = ("1", "L", "1 - L", "C_y", "P C_r")
+        sizes = dict(zip(names, self.bound(f, *names), strict=True))
         (least, most), s = sizes["P C_r"], sizes["1"][1]
         crossovers = find_crossings(lambda x: np.abs(self.open_loop(x)) - 1.0, f)
         ms, static = float(np.max(s)), 1.0 if self.law.integrators else float(least[0])
@@ -129,13 +148,15 @@ class DiscLoop:
             delay_margin_s=float(np.min(late)) if late.size else None,
             disk_margin=2.0 / float(np.max(sizes["1 - L"][1])),
             noise_gain=float(np.max(sizes["C_y"][1])),
+            other_noise_gains=tuple(
+                float(np.max(self.bound(f, "C_v", signal=signal)[0][1])) for signal in range(1, self.law.d.size - 1)
+            ),
         )
 
     def bandwidths_hz(self) -> tuple[float | None, float | None]:
         """Return the least and the largest bandwidth of the responses in the discs."""
         f = self.grid()
-        reference, negative = self.law.responses(f)[:2]
-        sizes = bound_disc("P C_r", self.plant.response(f), self.plant.discs(f), -negative, reference)
+        (sizes,) = self.bound(f, "P C_r")
         static = 1.0 if self.law.integrators else float(sizes[0][0])
         least, most = (_first(f, HALF_POWER * static - size) for size in sizes)
         return least, most
@@ -149,38 +170,54 @@ class DiscLoop:
 
 
 def bound_disc(
-    of: str, p: Any, r: Any, c_y: Any, c_r: Any, constant: Any = 1.0
+    of: str, p: Any, r: Any, c_y: Any, c_r: Any, constant: Any = 1.0, constant_radius: Any = 0.0, c_v: Any = 0.0
 ) -> tuple[Float[np.ndarray, "*k m"], Float[np.ndarray, "*k m"]]:
     """Return the least and the largest abs(X)/abs(1 + L) of the responses in discs; see the module's table. 1 + L is
-    `constant` + P C_y: of a model, without a disc, it holds what the law reads besides.
+    `constant` + P C_y, with `constant` in a disc of radius `constant_radius`: of a model both radii are zero.
     """
     open_loop = constant - 1.0 + p * c_y
-    a, reach = 1.0 + open_loop, r * np.abs(c_y)
-    size = np.abs(a) ** 2
+    reach, size = r * np.abs(c_y) + constant_radius, np.abs(1.0 + open_loop) ** 2
     room = np.maximum(size * leave_positive(1.0 - reach**2 / np.maximum(size, 1e-300)), 1e-300)
-    centre, radius = map_disc(of, p, r, c_y, c_r, open_loop, np.abs)
+    centre, radius, rooms = map_disc(of, p, r, c_y, c_r, open_loop, constant_radius, c_v, room, np.abs)
     centre = np.abs(centre)
-    return np.maximum(centre - radius, 0.0) / room, (centre + radius) / room
+    return np.maximum(centre - radius, 0.0) / rooms[0], (centre + radius) / rooms[1]
 
 
 def map_disc(
-    of: str, p: Any, r: Any, c_y: Any, c_r: Any, open_loop: Any, size: Callable[[Any], Any]
-) -> tuple[Any, Any]:
-    """Return centre and radius of the module's table, times D; of arrays or expressions, whose `size` is abs."""
-    back, reach = (1.0 + open_loop).conjugate(), r * size(c_y)
+    of: str,
+    p: Any,
+    r: Any,
+    c_y: Any,
+    c_r: Any,
+    open_loop: Any,
+    constant_radius: Any,
+    c_v: Any,
+    room: Any,
+    size: Callable[[Any], Any],
+) -> tuple[Any, Any, tuple[Any, Any]]:
+    """Return centre and radius of the module's table, times D, and what the least and the largest are to be divided by,
+    which is D, or `room` in its place, but for the last of the table; of arrays or expressions, whose `size` is abs.
+    """
+    one, alone = 1.0 + open_loop, r * size(c_y)
+    back, reach = one.conjugate(), alone + constant_radius
     match of:
         case "1":
-            return back, reach
+            return back, reach, (room, room)
         case "L":
-            return open_loop * back - reach * reach, reach
+            return open_loop * back - reach * reach, reach, (room, room)
         case "1 - L":
-            return (1.0 - open_loop) * back + reach * reach, 2.0 * reach
+            return (1.0 - open_loop) * back + reach * reach, 2.0 * reach, (room, room)
         case "C_y":
-            return c_y * back, reach * size(c_y)
+            return c_y * back, reach * size(c_y), (room, room)
+        case "C_v":
+            return c_v * back, reach * size(c_v), (room, room)
         case "P C_r":
-            return c_r * (p * back - c_y.conjugate() * (r * r)), r * size(c_r)
+            whole = size(one)
+            least = room + constant_radius * (whole + 3.0 * alone + constant_radius)
+            centre, radius = c_r * (p * back - c_y.conjugate() * (r * r)), r * size(c_r * (one - p * c_y))
+            return centre, radius, (least, room * (whole + alone) / (whole + reach))
         case _:
-            raise AssertionError("a measured response has no speed loop")
+            raise AssertionError(of)
 
 
 def _first(f: Frequencies, over: Frequencies) -> float | None:
@@ -247,7 +284,7 @@ def measure_discs(plant: MeasuredPlant, law: Law, bandwidth_hz: float) -> Measur
         name=plant.name,
         confidence=plant.confidence,
         points=plant.f.size,
-        band_hz=(float(plant.f[0]), float(plant.f[-1])),
+        band_hz=plant.band_hz,
         bandwidth_hz=loop.bandwidths_hz() if figures.stable else (None, None),
         **{name: getattr(figures, name) for name in taken},
     )

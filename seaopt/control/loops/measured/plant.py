@@ -12,15 +12,19 @@ radius. :math:`\tau` is the controller's delay, `delay_samples` of it; the drive
 
 **Between points** centre and radius are straight lines; the radius has an allowance for bends
 (`seaopt.frequency.measured`). **Below the band** the response is that of the lowest point, its phase in proportion to
-frequency: a static plant with a delay. One that turns there by more than a delay does is refused. **Above the band**
-abs(P) is no larger than at its end and falls at least as 1/f, at any phase: a disc around zero. A resonance there
-breaks this, and nothing in the points would show it.
+frequency: a static plant with a delay; of a motor's speed that of its position, times :math:`2\pi j f`. One that turns
+there by more than a delay does is refused. **Above the band** abs(P) is no larger than at its end and falls at least as
+1/f, at any phase: a disc around zero. A resonance there breaks this, and nothing in the points would show it.
+
+A law that reads several outputs has a response of each, from one log; the discs of all hold the truth together.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 
 from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.errors import ControlError
@@ -34,39 +38,38 @@ FOLDED = 200  # images of the spectrum that are summed; the rest by its bound
 MOST_TURN = 0.5  # rad: phase at the lowest point beyond that of the delays
 ASSUMED = (
     "open loop and a linear, stable plant; between points, straight lines with an allowance for bends; below the band, "
-    "the lowest point's gain; above it, no more than at its end, falling as 1/f"
+    "the lowest point's gain (of a speed, its position's); above it, no more than at its end, falling as 1/f"
 )
 
 
 @record(eq=False)
-class MeasuredPlant:
-    """Discs over frequency, from effort to what is measured, with hold and delay of the controller."""
+class MeasuredOutput:
+    """Discs over frequency, from effort to one output, with hold and delay of the controller."""
 
-    name: str  # of the experiment
     f: Frequencies  # the measured frequencies (Hz)
     centre: Response
     radius: Frequencies
-    sample_time_s: float  # seconds
     end: float  # abs(P) at the end of the band at most, without folding
     folded: float  # what folding adds to that above the band, at most
-    confidence: float  # of all discs
+    is_speed: bool = False  # which is zero at rest, where its position is not
 
     @property
-    def nyquist_hz(self) -> float:
-        """Half the sample rate."""
-        return 0.5 / self.sample_time_s
+    def rest(self) -> complex:
+        """The lowest point, and of a speed that of its position, in proportion to it."""
+        return complex(self.centre[0]) / (1j if self.is_speed else 1.0)
 
     @property
     def static_gain(self) -> float:
         """That assumed at 0 Hz, of the lowest point's size."""
-        return float(np.abs(self.centre[0]) * np.sign(np.real(self.centre[0])))
+        return 0.0 if self.is_speed else float(np.abs(self.rest) * np.sign(np.real(self.rest)))
 
     def response(self, f: VectorK) -> Complex[np.ndarray, " k"]:
         """Return the centres at any frequencies: zero above the band."""
         out = np.interp(f, self.f, np.real(self.centre)) + 1j * np.interp(f, self.f, np.imag(self.centre))
         below = f < self.f[0]
-        turn = np.angle(self.centre[0] * np.sign(np.real(self.centre[0])))
-        out[below] = self.static_gain * np.exp(1j * turn * f[below] / self.f[0])
+        share, sign = f[below] / self.f[0], np.sign(np.real(self.rest))
+        size = sign * np.abs(self.rest) * (1j * share if self.is_speed else 1.0)
+        out[below] = size * np.exp(1j * np.angle(self.rest * sign) * share)
         out[f > self.f[-1]] = 0.0
         return out
 
@@ -76,14 +79,71 @@ class MeasuredPlant:
         return np.where(f > self.f[-1], above, np.interp(f, self.f, self.radius))
 
 
+@record(eq=False)
+class MeasuredPlant:
+    """Discs over frequency of each output that a law reads, the regulated one first."""
+
+    name: str  # of the experiment
+    outputs: tuple[MeasuredOutput, ...]
+    sample_time_s: float  # seconds
+    confidence: float  # of all discs
+
+    @property
+    def f(self) -> Frequencies:
+        """The frequencies at which any output was measured."""
+        return np.unique(np.concatenate([output.f for output in self.outputs]))
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Where all outputs were measured."""
+        ends = zip(*((output.f[0], output.f[-1]) for output in self.outputs), strict=True)
+        lows, highs = ends
+        return float(max(lows)), float(min(highs))
+
+    @property
+    def nyquist_hz(self) -> float:
+        """Half the sample rate."""
+        return 0.5 / self.sample_time_s
+
+    @property
+    def static_gain(self) -> float:
+        """That of the regulated output, assumed at 0 Hz."""
+        return self.outputs[0].static_gain
+
+    def response(self, f: VectorK) -> Complex[np.ndarray, " k"]:
+        """Return the centres of the regulated output at any frequencies."""
+        return self.outputs[0].response(f)
+
+    def responses(self, f: VectorK, signals: int) -> Complex[np.ndarray, "y k"]:
+        """Return the centres of as many signals at any frequencies; what is read besides the outputs is zero."""
+        read = np.array([output.response(f) for output in self.outputs])
+        return np.pad(read, ((0, signals - len(read)), (0, 0)))
+
+    def discs(self, f: VectorK, signals: int) -> Float[np.ndarray, "y k"]:
+        """Return the radii of as many signals at any frequencies; what is read besides the outputs is zero."""
+        radii = np.array([output.discs(f) for output in self.outputs])
+        return np.pad(radii, ((0, signals - len(radii)), (0, 0)))
+
+
 def sample_measured(
-    measured: MeasuredResponse, gain: float, sample_time_s: float, delay_samples: float
+    outputs: Sequence[MeasuredResponse], gain: float, sample_time_s: float, delay_samples: float
 ) -> MeasuredPlant:
-    """Return what a controller sees of a measured response. `gain`: the input for one unit of what the controller
-    gives. `delay_samples`: samples from a reading to the command being put out, besides the hold. What is between a
-    command and its effect is in the log. Raises ControlError: its band ends beyond the controller's Nyquist frequency,
-    or its lowest point is not at rest.
+    """Return what a controller sees of measured responses, of one log. `gain`: the input for one unit of what the
+    controller gives. `delay_samples`: samples from a reading to the command being put out, besides the hold. What is
+    between a command and its effect is in the log. Raises ControlError: a band ends beyond the controller's Nyquist
+    frequency, or its lowest point is not at rest.
     """
+    return MeasuredPlant(
+        name=f"frf:{outputs[0].name}",
+        outputs=tuple(_sample_output(output, gain, sample_time_s, delay_samples) for output in outputs),
+        sample_time_s=sample_time_s,
+        confidence=outputs[0].confidence,
+    )
+
+
+def _sample_output(
+    measured: MeasuredResponse, gain: float, sample_time_s: float, delay_samples: float
+) -> MeasuredOutput:
     clock, f = measured.clock, measured.frequency_hz
     late = delay_samples * sample_time_s
     nyquist = 0.5 / sample_time_s
@@ -107,28 +167,23 @@ def sample_measured(
         above = np.linspace(f[-1], nyquist, 50)
         folded = float(np.max(_fold(above, own_clock, plain, f[-1])))
         turned, end = turned * ratio, plain
-    _check_rest(measured, f, turned, late + clock.delay_s + 0.5 * sample_time_s)
-    return MeasuredPlant(
-        name=f"frf:{measured.name}",
-        f=f,
-        centre=turned,
-        radius=radius,
-        sample_time_s=sample_time_s,
-        end=end,
-        folded=folded,
-        confidence=measured.confidence,
-    )
+    sensing = measured.plant.sensing
+    is_speed = sensing is not None and sensing.motor_speed == measured.output
+    seen = MeasuredOutput(f=f, centre=turned, radius=radius, end=end, folded=folded, is_speed=is_speed)
+    _check_rest(measured, seen, late + clock.delay_s + 0.5 * sample_time_s)
+    return seen
 
 
-def _check_rest(measured: MeasuredResponse, f: Frequencies, centre: Response, delay_s: float) -> None:
+def _check_rest(measured: MeasuredResponse, seen: MeasuredOutput, delay_s: float) -> None:
     """Refuse a response that is not that of rest and a delay at its lowest frequency."""
-    turn = float(np.angle(centre[0] * np.exp(2j * np.pi * f[0] * delay_s)))
+    lowest = float(seen.f[0])
+    turn = float(np.angle(seen.rest * np.exp(2j * np.pi * lowest * delay_s)))
     turn = min(abs(turn), abs(np.pi - abs(turn)))  # a static gain may be negative
     if turn > MOST_TURN:
         raise ControlError(
-            f"frf:{measured.name}: at {f[0]:.3g} Hz, the lowest frequency that was measured, the response still turns "
-            f"by {np.degrees(turn):.0f} deg more than its delay does, so that its gain at rest is not known; excite "
-            "lower frequencies, or give a model of it"
+            f"frf:{measured.name}: at {lowest:.3g} Hz, the lowest frequency at which {measured.output} was measured, "
+            f"the response still turns by {np.degrees(turn):.0f} deg more than its delay does, so that its gain at "
+            "rest is not known; excite lower frequencies, or give a model of it"
         )
 
 
