@@ -3,11 +3,13 @@ r"""A sampled loop at rest where a run's conditions are, such as an angle, inste
 The plant rests in the state x and under the current I of `seaopt.control.loops.sampled_plant.find_rest`, its measured
 force being y. The law rests with it where :math:`x_c = A x_c + B_r r - B_y y` and :math:`C x_c + D_r r - D_y y = I/g`:
 one linear equation for its state and for the reference r that keeps the plant there. With an integrator r is y;
-without one it is what makes the law command I. The commands that wait are all I.
+without one it is what makes the law command I. The commands that wait are all I. A schedule rests as the law that it is
+where its variable stands.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +18,7 @@ from jaxtyping import Float
 from seaopt.control.laws.realisation import Reading, RunnableLaw
 from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.loops.sampled_plant import find_rest
+from seaopt.control.running.law_step import LawShape
 from seaopt.control.running.loop_kernel import observe_function
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.errors import ControlError
@@ -49,26 +52,30 @@ class Equilibrium:
         )
 
 
-def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equilibrium:
+def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters], place: float = math.nan) -> Equilibrium:
     """Return where a loop, its current unlimited, rests at the conditions (such as phi) among each run's parameters; at
-    zero without any. Raises ControlError: the plant cannot rest there, or no reference makes the law command what it
-    takes.
+    zero without any. `place`: where the variable of a schedule stands. Raises ControlError: the plant cannot rest
+    there, or no reference makes the law command what it takes.
     """
-    law, plant = loop.law, loop.plant
-    assert isinstance(law, RunnableLaw)  # a schedule is held at a value
+    plant, law, terms, stands = loop.plant, loop.law, None, np.zeros(0)
+    before, around = np.cumsum(LawShape.of_law(law).sizes)[[3, 5]]  # what is kept before the place, and the command
+    if not isinstance(law, RunnableLaw):
+        law, terms, stands = law.freeze(place, law.compensation), law.find_terms(place), np.array([place])
     observe = observe_function(plant, sticks=False)
     names, rows = list(plant.outputs), [find_rest(plant, values) for values in params]
     figures = np.zeros((len(params), 5))
     z = np.zeros((len(params), loop.law_states + loop.waiting))
     for run, ((x, u), values) in enumerate(zip(rows, params, strict=True)):
         if not (np.any(x) or np.any(u)) and law.compensation is None and law.outer is None:
+            z[run, before : before + stands.size] = stands
             continue
         y = np.array(observe(0.0, x, u, values.vector)).ravel()
         read = y[[names.index(name) for name in loop.fed_back]]
         force, weight, added = float(read[0]), 0.0, 0.0
         if law.compensation is not None:
-            further = [float(y[names.index(name)]) if name in names else 0.0 for name in law.compensation.reads]
-            weight, added, _ = law.compensation.step(FORGOTTEN, 0.0, further)
+            known = {name: place for name in (loop.place,) if name is not None} | dict(zip(names, y, strict=False))
+            further = [float(known.get(name, 0.0)) for name in law.compensation.reads]
+            weight, added, _ = law.compensation.step(FORGOTTEN, 0.0, further, terms)
         inner, reference = _law_at_rest(
             law, read if law.measured > 1 else force, float(u[0]) - law.per_effort * added, plant, loop.regulated
         )
@@ -77,8 +84,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters]) -> Equ
         if law.outer is not None:
             position = float(y[names.index(law.outer.position)]) if law.outer.position in names else 0.0
             given = law.outer.split(position)[0] + reference / law.outer.per_given
-        forgotten = np.zeros(loop.law_states - inner.size - 1)
-        z[run] = np.concatenate([inner, forgotten, np.full(1 + loop.waiting, u[0])])
+        z[run, : inner.size], z[run, before : before + stands.size], z[run, around:] = inner, stands, u[0]
         figures[run] = reference, given, force, u[0], 0.0 if plant.energy is None else y[-1]
     reference, given, force, current, energy = figures.T.copy()
     state = LoopState(x=np.stack([x for x, _ in rows]), z=z)

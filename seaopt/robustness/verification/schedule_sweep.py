@@ -33,9 +33,9 @@ import numpy as np
 from seaopt.codec import OrInfinite
 from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.running.closed_loop import LoopRun, LoopState, run_loop
-from seaopt.control.running.law_step import find_faults, list_kept
+from seaopt.control.running.equilibrium import Equilibrium, equilibrium
+from seaopt.control.running.law_step import find_faults
 from seaopt.control.running.loop_kernel import Rows
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
@@ -44,7 +44,6 @@ from seaopt.executors import Shared, map_ordered
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import output_function
 from seaopt.progress import Progress, ignore
 from seaopt.records import record
 from seaopt.robustness.verification.judgement import Judge, find_saturated, take_ends
@@ -224,28 +223,26 @@ def _run_sweep(
 
 @record(eq=False)
 class RestStart:
-    """Where a run starts: the plant at rest at a value of the variable, what it measures there, and what holds it."""
+    """Where a run starts: the loop at rest at a value of the variable."""
 
     schedule: ScheduledController
     params: ParameterSet
     value: float  # of the variable
     states: dict[str, float]
-    readings: dict[str, float]
-    command: float
+    rest: Equilibrium
 
     @classmethod
     def at_rest(cls, schedule: ScheduledController, plant: Plant, params: ParameterSet, value: float) -> RestStart:
         """Return where a plant rests with the variable at a value."""
-        placed = plant.complete(place_variable(plant, params, schedule.over, value))
-        x, u = find_rest(plant, placed)
-        outputs = np.array(output_function(plant)(0.0, x, u, placed.vector)).ravel()
+        placed, law = plant.complete(place_variable(plant, params, schedule.over, value)), schedule.runnable(outer=True)
+        loop = build_loop(schedule.controllers[0], plant, [placed], law, place=schedule.over)
+        rest = equilibrium(loop, [placed], value)
         return cls(
             schedule=schedule,
             params=placed.drop_conditions(),
             value=value,
-            states=dict(zip(plant.states, x.tolist(), strict=True)),
-            readings=dict(zip(plant.outputs, outputs.tolist(), strict=True)),
-            command=float(u[0]),
+            states=dict(zip(plant.states, rest.state.x[0].tolist(), strict=True)),
+            rest=rest,
         )
 
     @property
@@ -258,26 +255,18 @@ class RestStart:
         `places` are for a plant that does not have the variable. Raises SimulationError: to hold it there takes
         more than the command's limit, the loop runs away, or the gate gives its sensor up.
         """
-        law, value = self.schedule.runnable(outer=True), self.value
-        if abs(self.command) > law.command_limit:
-            needed, limit = (show_command(value, *law.command) for value in (abs(self.command), law.command_limit))
+        law, held = self.schedule.runnable(outer=True), abs(float(self.rest.current_A[0]))
+        if held > law.command_limit:
+            needed, limit = (show_command(value, *law.command) for value in (held, law.command_limit))
             raise SimulationError(
                 f"{needed} holds it at {self.schedule.over} = {self.value:.4g}, above the limit of {limit}"
             )
-        fed = np.array([self.readings[name] for name in self.schedule.controllers[0].signals])
         loop = build_loop(self.schedule.controllers[0], plant, [values], law, place=self.schedule.over)
-        named = {self.schedule.over: value} | self.readings
-        further = [named.get(name, 0.0) for name in law.further]
-        reference = float(fed[0]) - _weigh(law, named, value)
-        played = reference + references
+        played, count = self.rest.given[0] + references, len(references)
         if law.outer is not None:
-            x_0, _ = law.outer.split(self.readings.get(law.outer.position, 0.0))
             travelled, _ = law.outer.split(_travel(plant, law.outer, values, references.shape[1]))
-            reference = reference / law.outer.per_given + x_0
-            played = reference + references / law.outer.per_given + travelled
-        kept = list_kept(law, law.reset(reference, fed, value, self.command, readings=further))
-        x, z = [self.states[name] for name in plant.states], [*kept, *[self.command] * loop.waiting]
-        count = len(references)
+            played = self.rest.given[0] + references / law.outer.per_given + travelled
+        x, z = [self.states[name] for name in plant.states], self.rest.state.z
         start = LoopState(x=np.tile(x, (count, 1)), z=np.tile(z, (count, 1)))
         run = run_loop(loop, [values] * count, played, start=start, places=places)
         if not all(np.all(np.isfinite(rows)) for rows in (*run.outputs.values(), run.current)):

@@ -7,9 +7,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import seaopt as so
+from seaopt.control import CompensateGravity
+from seaopt.control.compensation.gravity import make_gravity_term
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.robustness.verification import schedule_motion
 from seaopt.robustness.verification.schedule_motion import describe_motion, move_schedule
-from seaopt.robustness.verification.schedule_sweep import sweep_schedule
+from seaopt.robustness.verification.schedule_sweep import RestStart, sweep_schedule
 from tests.schedules import read_knee, tune_knee
 
 L_A, K, MASS, B, FORCE = 0.0725, 655e3, 294.0, 11600.0, 240.0  # problems/lever_knee.toml
@@ -55,6 +59,28 @@ def simulate(table, reference, middle):
         x = solve_ivp(shank, (0.0, TS), x, args=(waiting,), method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
         waiting = effort / FORCE
     return out
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.8])
+def test_a_run_starts_at_the_rest_that_the_equations_have(fraction):
+    """Torque, spring and current of an angle at which the shank is held, and nothing moves while the push is none."""
+    schedule, (_, swing, values), angle = tune_knee(), read_knee(), 0.3
+    if fraction:
+        link = so.plants.rotary(link="pendulum")
+        weight = link, link.defaults.update(m=MGL / (9.81 * 0.2), L=0.2)
+        term = replace(make_gravity_term(*weight, "tau_s", CompensateGravity(fraction=fraction)), reads="phi")
+        terms = Compensation(sample_time_s=TS, gravity=term)
+        laws = tuple(replace(each, compensation=terms) for each in schedule.controllers)
+        schedule = replace(schedule, controllers=laws)
+    start = RestStart.at_rest(schedule, swing, values, angle)
+    run = start.run(swing, start.params, np.zeros((1, 300)))
+    torque = MGL * np.sin(angle)
+    force = torque / (L_A * np.cos(angle))
+    assert run.outputs["tau"][0] == pytest.approx(np.full(300, torque), rel=1e-9)
+    assert run.current[0] == pytest.approx(np.full(300, force / FORCE), rel=1e-9)
+    assert start.states == pytest.approx({"q": L_A * np.sin(angle) + force / K, "v": 0.0, "phi": angle, "omega": 0.0})
+    assert start.rest.reference[0] == pytest.approx((1.0 - fraction) * torque, rel=1e-5)
+    assert np.max(np.abs(start.find_errors(run, np.full(300, angle)))) < 1e-9 * torque
 
 
 @pytest.mark.slow
