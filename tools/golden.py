@@ -3,8 +3,9 @@
 python tools/golden.py write [SUBJECT ...]     into tests/golden, one file per subject; all subjects if none is named
 python tools/golden.py compare [SUBJECT ...]   prints each difference; exit code 1 if there is one
 
-Numbers agree to 1e-9 of the larger one; names, orders, verdicts and exit codes agree exactly. Sentences are compared
-with --sentences only: their words may get better while figures stay.
+Numbers agree to 1e-9 of the larger one, those of a series also to the rounding of its largest, and those that are known
+to less to what is stated with them; names, orders, verdicts and exit codes agree exactly. Sentences are compared with
+--sentences only: their words may get better while figures stay.
 """
 
 from __future__ import annotations
@@ -77,9 +78,12 @@ def tidy(content: Any) -> Any:
     return repr(content) if isinstance(content, float) and not math.isfinite(content) else content
 
 
-def compare(before: Any, after: Any, place: str, *, sentences: bool) -> Iterator[str]:
-    """Yield a line for each difference."""
-    if isinstance(before, dict) and isinstance(after, dict):
+def compare(before: Any, after: Any, place: str, *, sentences: bool, size: float = 1.0) -> Iterator[str]:
+    """Yield a line for each difference; `size` is that of the largest of a series."""
+    if isinstance(before, dict) and isinstance(after, dict) and "within" in before.keys() & after.keys():
+        if not math.isclose(before["near"], after["near"], rel_tol=before["within"], abs_tol=ATOL):
+            yield f"{place}: {before['near']!r} before, {after['near']!r} now, within {before['within']:g}"
+    elif isinstance(before, dict) and isinstance(after, dict):
         if list(before) != list(after):
             gone, new = ([key for key in one if key not in two] for one, two in ((before, after), (after, before)))
             yield f"{place}: keys {f'gone: {gone}, new: {new}' if gone or new else 'in another order'}"
@@ -89,10 +93,11 @@ def compare(before: Any, after: Any, place: str, *, sentences: bool) -> Iterator
     elif isinstance(before, list) and isinstance(after, list):
         if len(before) != len(after):
             yield f"{place}: {len(before)} values before, {len(after)} now"
+        size = max((abs(value) for value in before if is_number(value)), default=1.0)
         for i, (one, two) in enumerate(zip(before, after, strict=False)):
-            yield from compare(one, two, f"{place}[{i}]", sentences=sentences)
+            yield from compare(one, two, f"{place}[{i}]", sentences=sentences, size=max(size, 1.0))
     elif is_number(before) and is_number(after):
-        if not math.isclose(before, after, rel_tol=RTOL, abs_tol=ATOL):
+        if not math.isclose(before, after, rel_tol=RTOL, abs_tol=ATOL * size):
             yield f"{place}: {before!r} before, {after!r} now"
     elif before != after and (sentences or not (is_sentence(before) and is_sentence(after))):
         yield f"{place}: {before!r} before, {after!r} now"
