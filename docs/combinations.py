@@ -96,7 +96,9 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "`prefilter`": {"CONTROLLER": 'prefilter = "second_order"'},
     "`link_feedforward`": {"CONTROLLER": "link_feedforward = true", "ROBUST_TO": '"swing"', "CERTIFIED": '"swing"'},
     "friction, from the reference": {"CONTROLLER": "compensate = { friction = { fraction = 0.4 } }", "COULOMB": "0.002"},
-    "friction, from the speed": {"CONTROLLER": 'compensate = { friction = { fraction = 0.4, from = "speed" } }', "COULOMB": "0.002"},
+    "friction, from the speed": {
+        "CONTROLLER": 'compensate = { friction = { fraction = 0.4, from = "speed" } }', "COULOMB": "0.002", "CERTIFIED": '"swing"',
+    },
     "weight of the link": {"CONTROLLER": 'compensate = { gravity = { plant = "swing", fraction = 0.8 } }', "CERTIFIED": '"swing"'},
     "`[impedance]`": {"TABLES": '[impedance]\nplant = "swing"\nstiffness = 30\ndamping = 2.0'},
     "`[controller.gate]`": {"TABLES": "[controller.gate]\nrange_N = [-300, 300]"},
@@ -105,7 +107,7 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "plants to certify on": {"CERTIFIED": '"swing"'},
     "`retune`": {"ROBUSTNESS": "retune = 2", "CERTIFIED": '"swing"'},
     "`seaopt tune --sweep`": {},
-}
+}  # fmt: skip
 DEFAULTS = {"PLANT": "stand", "MEASURED": '"tau_s"', "ROBUST_TO": "", "CERTIFIED": '"stand"', "COULOMB": "0", "ROBUSTNESS": "retune = 0"}
 HEAD = """# What goes with what
 
@@ -115,6 +117,7 @@ here, and run the whole table.
 
 - A law of your own is what it is: notch, prefilter and link feedforward of `[controller]` are not used.
 - A law designed on `frf:` is simulated on the plants that it is certified on. What no response tells, heat, friction and the largest step of a reading, is of the model of the plant that was measured.
+- What feeds back the motion of motor or link on a law designed on `frf:`, friction compensated from the speed or the weight of the link, is shown to be stable on models: name them in `[robustness] plants`.
 - A sweep of predictive control has its linear region, in which no limit is active.
 - A sweep is run, and nothing of it is exported.
 - The impedance has a number for its damping: `"critical"` is refused where something in the loop swings more slowly than the link.

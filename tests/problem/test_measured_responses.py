@@ -235,12 +235,24 @@ def test_a_design_on_a_response_takes_the_motion_of_the_link_of_a_model(tmp_path
     assert narrow[1] < narrow[0]  # the swinging link hinders tracking from further down
 
 
-def test_what_feeds_the_motor_back_is_refused_where_the_loop_is_measured(tmp_path):
+def test_what_feeds_the_motor_back_is_shown_to_be_stable_on_models(tmp_path, monkeypatch):
+    """A response is of friction that slides; stability with it compensated as it is at rest takes a model."""
+    leave_out(monkeypatch, SIMULATIONS)
     path = tmp_path / "knee.toml"
-    path.write_text(WARM.replace("fraction = 0.4", 'fraction = 0.4, from = "speed"'))
+    speed = re.sub("compensate = .*", 'compensate = { friction = { fraction = 0.2, from = "speed" } }', WARM)
+    speed = speed.replace("derate = true", 'robust_to = ["swing"]')
+    path.write_text(speed)
     problem = so.read_problem(path)
-    with pytest.raises(ControlError, match=r"compensate\.friction: it feeds the motor's motion back"):
-        tune_problem(problem, problem.parameters)
+    controller = tune_problem(problem, problem.parameters)
+    assert controller.design is None and controller.compensation.friction.reads == "theta_m"
+    certificate = certify_problem(problem, controller, problem.parameters)
+    shown = [row for row in certificate.requirements if row.name == "friction_compensation"]  # nominal and drawn
+    assert {row.plant: row.met for row in shown} == {"design": True, "swing": True}, shown
+    assert [text for text in certificate.remarks if text.startswith("frf:chirp: of the law where friction slides")]
+    path.write_text(speed.replace('["swing"]', "[]"))
+    problem = so.read_problem(path)
+    with pytest.raises(ControlError, match=r"compensate\.friction feeds the motor's motion back, most steeply at rest"):
+        certify_problem(problem, controller, problem.parameters)
 
 
 def test_a_law_of_ones_own_is_measured_on_the_response(write, tmp_path):

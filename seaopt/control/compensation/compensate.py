@@ -55,10 +55,9 @@ def add_compensation(
     Raises
     ------
     ControlError
-        The controller knows no such plant; it was designed on a measured response, and speed or ripple would be fed
-        back; no friction is where the motor acts; the reference is that of an
-        outer loop, and friction would be compensated from it; nothing is shown to be stable for the measured speed; or
-        the motor's position has no revolution.
+        The controller knows no such plant; no friction is where the motor acts; the reference is that of an outer loop,
+        and friction would be compensated from it; nothing is shown to be stable for the measured speed; or the motor's
+        position has no revolution.
 
     Examples
     --------
@@ -77,12 +76,6 @@ def add_compensation(
         )
     if friction is None and gravity is None and ripple is None:
         return replace(controller, compensation=None)
-    fed_back = "ripple" * (ripple is not None) or "friction" * (friction is not None and friction.source == "speed")
-    if fed_back and controller.designs_on_response:
-        raise ControlError(
-            f"compensate.{fed_back}: it feeds the motor's motion back, and of the loop with it a measured response of "
-            f"{controller.spec.regulated} says nothing; design on a model, and name the response in robust_to"
-        )
     added = Compensation(
         sample_time_s=controller.sample_time_s,
         friction=None if friction is None else _meet_friction(controller, *model, friction),

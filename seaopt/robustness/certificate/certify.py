@@ -249,14 +249,20 @@ def _take_law(subject: Any) -> Controller:
 
 def _check_responses(law: Controller, plants: Plants, measured: Mapping[str, MeasuredResponse]) -> None:
     """Refuse models, or no response, of a controller that was designed on a measured response, and responses alone of
-    one that reads the motion of a link.
+    one that feeds back what no response tells.
     """
-    weighs = law.compensation is not None and law.compensation.gravity is not None
-    reads = "link_feedforward" if law.link is not None else "compensate.gravity" if weighs else ""
-    if not plants and reads:
+    terms = law.compensation
+    if not plants and (law.link is not None or (terms is not None and terms.gravity is not None)):
+        reads = "compensate.gravity" if law.link is None else "link_feedforward"
         raise ControlError(
             f"{reads} reads the motion of a link, of which a measured response says nothing; name the plant whose link "
             "moves in plants of [robustness]"
+        )
+    if not plants and terms is not None and (terms.ripple is not None or (terms.friction and terms.friction.reads)):
+        raise ControlError(
+            f"compensate.{'friction' if terms.ripple is None else 'ripple'} feeds the motor's motion back, most "
+            "steeply at rest, and a response is measured where friction slides; name a model of the plant in plants "
+            "of [robustness]"
         )
     if plants:
         raise ControlError(

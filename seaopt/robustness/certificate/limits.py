@@ -50,6 +50,10 @@ WITH_TERMS = (
     "compensated of its weight and, where it sticks, with friction's compensation from the speed; what is asked of the "
     "design plant alone is of the law as tuned"
 )
+WHERE_IT_SLIDES = (
+    "of the law where friction slides, as it did in the log, and its compensation from the speed is at its full size; "
+    "at rest both are steepest, which models show"
+)
 NO_LOG = "no log of the fit is of a plant that is certified, so that none judges the law"
 SILENT = {
     "lacks a signal": "log {0.experiment} does not judge the law: it has no {0.detail}",
@@ -111,6 +115,9 @@ def measure_responses(context: CheckContext, _: Progress) -> Evidence:
             rows += (replace(row, place=place, risk=1.0 - response.confidence) for row in of_response)
         plant = controller.spec.see_response(response, controller.command)
         remarks.append(str(measure_discs(plant, controller.law, controller.spec.bandwidth_hz)))
+        terms = controller.compensation
+        if terms is not None and terms.friction is not None and terms.friction.reads:
+            remarks.append(f"{name}: {WHERE_IT_SLIDES}")
     return Evidence(requirements=rows, remarks=tuple(remarks), scope="measured")
 
 
