@@ -34,6 +34,7 @@ from seaopt.simulation import (
 CACHED_SAMPLES = 1 << 14  # whose sums stay in a core's cache
 FIRST_SAMPLES = 8_000  # that tell the integration error in an output, and a filter's sizes and places
 MAX_SUBSTEPS = 256
+ROUNDED = 1.5  # times the rms of a rounding's error, up to which a residual is taken for that
 
 
 @record(eq=False)
@@ -132,6 +133,12 @@ class FitExperiment:
         sections, settle = design_filter(self.band_hz, self.period)
         knee = self.loss.threshold * self.sigma
         return Weights(sections=sections, settle=settle, knee=knee, loss=self.loss.kind)
+
+    def is_rounding(self, rms: PerOutput) -> bool:
+        """Tell whether residuals of such an rms are the rounding of readings, of steps that are stated."""
+        plain = self.loss.quadratic and self.predictor is None and self.band_hz is None
+        steps = np.array([self.data.quantisation.get(name, 0.0) for name in self.data.outputs])
+        return plain and bool(np.all(rms <= ROUNDED * steps / np.sqrt(12.0)))
 
     @property
     def level_unseen(self) -> bool:

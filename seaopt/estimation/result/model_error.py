@@ -40,7 +40,7 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.noise_floor import NoiseFloor, list_excess
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, ResidualsByExperiment, stream_columns
-from seaopt.estimation.problem.rounding import Rounding
+from seaopt.estimation.problem.rounding import Rounding, equate
 from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal, Vector
 from seaopt.estimation.result.covariance import compute_bread, compute_influence, map_to_influence, take_root
 from seaopt.records import record
@@ -110,6 +110,8 @@ def estimate_model_error(
     variance = np.where(np.isfinite(np.diag(noise)), np.diag(noise), 0.0)
     white = np.diag(inverse @ sums.power @ inverse)
     rounded, known = inverse @ sums.rounded @ inverse, inverse @ sums.stated @ inverse
+    if sums.known:
+        known = _resize(known, equate(sums.known, inverse, np.diag(known)))
     others = np.clip(1.0 - np.diag(inverse @ sums.stated_power @ inverse) / np.maximum(white, 1e-300), 0.0, 1.0)
     found = [variance, white, np.diag(scores)]
     noisy = np.maximum.reduce([*(others * each for each in found), np.diag(rounded)]) + np.diag(known)
@@ -150,8 +152,8 @@ class _Sums:
     `error_power` the information of the outputs weighted with the power of their residuals, and with that of the
     model's error, `stated` and `stated_power` with the errors of those whose rounding is stated, and with the power of
     their residuals, `found` with the errors of each output whose rounding the log shows, and with white ones of the
-    same power, `coarse` both kinds of rounding, `effect` the largest rms over the outputs' spreads that a unit of each
-    makes.
+    same power, `coarse` all roundings and `known` those that are stated, `effect` the largest rms over the outputs'
+    spreads that a unit of each makes.
     """
 
     information: Float[np.ndarray, "parts q q"]
@@ -166,6 +168,7 @@ class _Sums:
     error_power: ParameterMatrix
     found: Mapping[str, tuple[ParameterMatrix, ParameterMatrix]]
     coarse: Sequence[Rounding]
+    known: Sequence[Rounding]
     effect: ParameterVector
     count: float
 
@@ -238,7 +241,7 @@ def _sum_parts(
     half_information, half_score, in_half = np.zeros((HALVES, q, q)), np.zeros((HALVES, q)), np.zeros(HALVES)
     windows, power, stated, stated_power, error_power = (np.zeros((q, q)) for _ in range(5))
     found, effect = dict[str, tuple[ParameterMatrix, ParameterMatrix]](), np.zeros(q)
-    every = list[Rounding]()
+    every, known = list[Rounding](), list[Rounding]()
     masks = {
         e.name: [np.any(s.mark_counted(e.weights.settle), axis=1) for s in e.segments] for e in problem.experiments
     }
@@ -283,6 +286,7 @@ def _sum_parts(
             made = if_white if rounding is None else rounding.multiply(gram)
             if floor.step[o] and output.name in experiment.data.quantisation:
                 stated, stated_power = stated + made, stated_power + rms2[o] * gram
+                known += [rounding] if rounding is not None else []
             elif rounding is not None:
                 found[output.label] = made, if_white
         every += [rounding for rounding in coarse if rounding is not None]
@@ -302,6 +306,7 @@ def _sum_parts(
         error_power=error_power,
         found=found,
         coarse=every,
+        known=known,
         effect=effect,
         count=float(sum(np.sum(floor.count) for floor in floors.values())),
     )

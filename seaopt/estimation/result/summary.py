@@ -163,7 +163,8 @@ def _find_oddities(fitted: ParameterSet, params: ParameterSet, evaluation: Evalu
 def _compute_covariances(
     problem: FitProblem, evaluation: Evaluation, statistics: StatisticsByExperiment | None
 ) -> tuple[ParameterMatrix, ParameterMatrix, Float[np.ndarray, "q q"], ParameterVector, Vector]:
-    """Return the parameters' covariance for white residuals and for the actual ones, and how much is unseen. Both are
+    """Return the parameters' covariance for white residuals and for the actual ones, and how much is unseen. The colour
+    of residuals that are a stated rounding's is known, and in the model covariance (`rounding`). Both are
     over what is seen alone, and so is the third, of parameters and delays together; the fourth is how much of each
     parameter is not seen (0 to 1, squared). The last are the variances of all unknowns: of parameters, delays and gains
     for the actual residuals, of others for white ones.
@@ -183,7 +184,8 @@ def _compute_covariances(
     if not problem.loss.quadratic:
         sums = statistics if statistics is not None else compute_statistics(problem, z)
         white = columns.T @ compute_white_meat(problem, z, sums) @ columns + from_priors
-    robust = white if statistics is None else compute_meat(problem, z, columns, statistics) + from_priors
+    of_rounding = all(e.is_rounding(evaluation.power[e.name].rms) for e in problem.experiments)
+    robust = white if statistics is None or of_rounding else compute_meat(problem, z, columns, statistics) + from_priors
     variance[stated] = np.diag(robust)
     return white[:p, :p], robust[:p, :p], robust[:q, :q].copy(), unseen[:p], variance
 

@@ -6,7 +6,7 @@ from scipy.signal import chirp, cont2discrete, dlsim
 
 import seaopt as so
 from seaopt.errors import EstimationError
-from seaopt.estimation.problem.rounding import Rounding
+from seaopt.estimation.problem.rounding import Rounding, equate
 
 RATE_HZ, N, K_TAU = 500.0, 50.0, 0.07
 TRUTH = {"J_m": 4e-5, "b_r": 1e-3, "k_s": 300.0}
@@ -136,3 +136,22 @@ def test_a_step_that_the_readings_do_not_have_is_refused():
     so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation={"theta_m": 0.5 * step})
     with pytest.raises(EstimationError, match="quantisation names"):
         so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation={"theta_l": step})
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_the_interval_is_that_of_errors_of_one_phase(noise):
+    """A motion over a step or two: 95 % of the drawn errors are within it, where 1.96 std would hold nearly all."""
+    rng, q, t = np.random.default_rng(11), 0.7, np.arange(300) / 300
+    y = 0.9 * q * np.sin(2 * np.pi * 2.3 * t)
+    influence = np.stack([np.sin(2 * np.pi * 2.3 * t), np.cos(5.0 * t)])
+    moved = []
+    for phase in rng.uniform(0.0, q, 6000):
+        read = np.round((y + phase + noise * q * rng.normal(size=t.size)) / q) * q - phase
+        moved.append(influence @ (read - y))
+    rounding = Rounding.of(q, float(q * np.hypot(noise, 1.0 / np.sqrt(12.0))), 2)
+    rounding.add(influence, y - q * np.round(y / q))
+    variances = np.diag(rounding.multiply(influence @ influence.T))
+    half = 1.96 * np.sqrt(equate([rounding], np.eye(2), variances))
+    assert np.mean(np.abs(moved) <= half, axis=0) == pytest.approx(0.95, abs=0.015)
+    if not noise:
+        assert np.mean(np.abs(moved)[:, 0] <= 1.96 * np.sqrt(variances[0])) > 0.99
