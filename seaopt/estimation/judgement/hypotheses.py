@@ -8,7 +8,7 @@ such as play, have no slope there, and start from a size that actuators have.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, fields, replace
 
 import casadi as ca
@@ -18,11 +18,14 @@ from jaxtyping import Float
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.ripple_search import find_followed_ripple, find_ripple, move_zero
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
+from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, add_part
+from seaopt.plants.memo import memo
 from seaopt.plants.parts import list_dead_times
 from seaopt.plants.plant import name_symbols
 from seaopt.records import record
@@ -208,6 +211,68 @@ class Change:
     def parts(self) -> tuple[str, ...]:
         """The parts that are added."""
         return tuple(dict.fromkeys(hypothesis.part for hypothesis in self.hypotheses))
+
+
+@record(eq=False)
+class Addition:
+    """An effect that logs may not show, its part ("" where plants have it), and its parameter at the neutral value."""
+
+    effect: str
+    part: str
+    parameter: Parameter
+    size: float  # that actuators have
+    experiments: Mapping[str, Experiment]  # all of a fit, with its part and those of the additions before it
+
+
+def list_additions(problem: FitProblem, z: Vector) -> Iterator[Addition]:
+    """Yield the hypotheses that logs may not show, on those experiments whose plants take them, one after the other;
+    and what plants have of it without a part, fixed. `z`: the values of the fit.
+    """
+    fitted = (replace(problem.params[name], value=float(z[i])) for i, name in enumerate(problem.shared_names))
+    params = problem.params.with_parameters(*fitted)
+    experiments = {experiment.name: experiment.data for experiment in problem.experiments}
+    for hypothesis in HYPOTHESES:
+        if hypothesis.usual is None:
+            continue
+        changed, names = dict[str, Experiment](), set[str]()
+        for name, experiment in experiments.items():
+            if (built_in := hypothesis.built_in(experiment.plant)) is not None:
+                if built_in not in experiment.parameters:
+                    changed[name] = experiment
+                    names.add(built_in)
+            elif (plant := _add(experiment.plant, hypothesis.part)) is not None:
+                changed[name] = replace(experiment, plant=plant)
+                names |= plant.parameters.keys() - experiment.plant.parameters.keys()
+        if len(names) != 1:
+            continue
+        (name,) = names
+        first = next(iter(changed.values()))
+        parameter, spring = first.plant.parameters[name], first.plant.spring
+        is_there = name in experiments[first.name].plant.parameters
+        if is_there:
+            parameter = params[name]
+        elif name in params:
+            continue
+        if not isinstance(parameter, Parameter) or parameter.free or spring is None or not spring.stiffness:
+            continue
+        stiffness = first.plant.complete(first.apply_own(params))[spring.stiffness].value
+        experiments = experiments | changed
+        yield Addition(
+            effect=hypothesis.effect + (" more" if parameter.value else ""),
+            part="" if is_there else hypothesis.part,
+            parameter=parameter,
+            size=hypothesis.usual(stiffness),
+            experiments=experiments,
+        )
+
+
+@memo
+def _add(plant: Plant, part: str) -> Plant | None:
+    """Return a plant with a part; None where it does not take it."""
+    try:
+        return add_part(plant, part)
+    except SeaoptError:
+        return None
 
 
 def change_plants(

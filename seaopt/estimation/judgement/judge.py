@@ -106,7 +106,7 @@ def judge(
     floors = measure_floors(minimum.problem, residuals, minimum.z)
     error = estimate_model_error(minimum.problem, minimum.z, residuals, floors, noise.matrix)
     fit = compare_logs(widen(_state_excess(fit, error.excess), error.matrix), validation)
-    fit = replace(fit, silent=find_silent(fit))
+    fit = replace(fit, silent=find_silent(fit, freed))
     with limit_evaluations(TESTS * evaluations):
         another = list(find_other_minimum(fit))
     findings = [

@@ -16,12 +16,15 @@ has to move, see `causes`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.errors import SeaoptError
+from seaopt.estimation.judgement.hypotheses import Addition, list_additions
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
@@ -58,34 +61,50 @@ class Freed:
 
     problem: FitProblem
     z: Vector
-    units: Mapping[str, str]  # of what is free besides
+    units: Mapping[str, str]  # of what is free besides, and is tested
     bending: tuple[str, ...] = ()  # fixed parameters that are not free here, for they make a linear plant nonlinear
+    additions: tuple[Addition, ...] = ()  # that are free here as well, at their neutral values
 
     @classmethod
     def make(
-        cls, problem: FitProblem, z: Vector, names: tuple[str, ...], data: Mapping[str, Experiment] | None = None
+        cls,
+        problem: FitProblem,
+        z: Vector,
+        names: tuple[str, ...] = (),
+        delays: Mapping[str, float] | None = None,
+        additions: Sequence[Addition] = (),
     ) -> Freed:
-        """Return the problem in which parameters of these names are free, and the delays of experiments that have a
-        free one in `data`, under the name EXPERIMENT.delay_s.
+        """Return the problem in which parameters of these names are free, and the delays of experiments, from given
+        values, under the name EXPERIMENT.delay_s; and with what is added.
         """
-        units = {name: problem.params[name].unit for name in names} | {f"{name}.delay_s": "s" for name in data or {}}
-        freed, at = problem.rebuild(free_more(problem.params, names), z, data)
-        return cls(problem=copy_steps(freed, problem), z=at, units=units)
+        data = dict(additions[-1].experiments) if additions else {e.name: e.data for e in problem.experiments}
+        data |= {name: free_delay(data[name], value) for name, value in (delays or {}).items()}
+        added = (replace(addition.parameter, free=True) for addition in additions)
+        params = free_more(problem.params, names).with_parameters(*added)
+        freed, at = problem.rebuild(params, z, data)
+        units = {name: problem.params[name].unit for name in names} | {f"{name}.delay_s": "s" for name in delays or {}}
+        return cls(problem=copy_steps(freed, problem), z=at, units=units, additions=tuple(additions))
 
 
 def free_fixed(problem: FitProblem, z: Vector) -> Freed:
-    """Return the problem with all free that leaves linear plants linear, delays too. Its passes are made, where there
-    is room, and those of the problem itself kept as parts of them.
+    """Return the problem with all free that leaves linear plants linear, delays too; and with the effects that logs may
+    not show, where plants with them are simulated alike. Its passes are made, where there is room, and those of the
+    problem itself kept as parts of them.
     """
     plain, bending = find_candidates(problem)
     delays = {
-        e.name: free_delay(e.data, e.slots.delay.value)
+        e.name: e.slots.delay.value
         for e in problem.experiments
         if e.slots.delay.index is None and not depends_on_time(e.model)
     }
-    freed = replace(Freed.make(problem, z, plain, delays), bending=bending)
+    freed: Freed | None = None
+    with suppress(SeaoptError):  # what does not make a problem is left out
+        additions = () if problem.predicts else tuple(list_additions(problem, z))
+        freed = Freed.make(problem, z, plain, delays, additions) if additions else None
+    if freed is None or not problem.simulates_alike(z, freed.problem, freed.z):
+        freed = Freed.make(problem, z, plain, delays)
     problem.keep_within(z, freed.problem, freed.z)
-    return freed
+    return replace(freed, bending=bending)
 
 
 def run_score_tests(minimum: Minimum, freed: Freed | None = None) -> dict[str, ScoreTest]:
@@ -104,7 +123,8 @@ def run_score_tests(minimum: Minimum, freed: Freed | None = None) -> dict[str, S
         return {}
     places = np.array([trial.unknowns.names.index(name) for name in units])
     statistics = minimum.statistics or compute_statistics(trial, z)
-    score, information, variance = _compute_scores(trial, evaluation, places, statistics)
+    neutral = [each.parameter.name for each in freed.additions]
+    score, information, variance = _compute_scores(trial, evaluation, places, neutral, statistics)
     chosen = np.flatnonzero((information > REDUNDANT * np.diag(evaluation.hessian)[places]) & (variance > 0.0))
     order = sorted(chosen, key=lambda i: score[i] ** 2 / information[i], reverse=True)
     rows = list(units.items())
@@ -156,12 +176,19 @@ def free_more(params: ParameterSet, names: tuple[str, ...]) -> ParameterSet:
 
 
 def _compute_scores(
-    trial: FitProblem, evaluation: Evaluation, places: Int[np.ndarray, " c"], statistics: StatisticsByExperiment
+    trial: FitProblem,
+    evaluation: Evaluation,
+    places: Int[np.ndarray, " c"],
+    neutral: Sequence[str],
+    statistics: StatisticsByExperiment,
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return scores, their information, and their variances with the residuals as coloured as they are."""
+    """Return scores, their information, and their variances with the residuals as coloured as they are. `neutral`:
+    unknowns that stay where they are.
+    """
     unknowns, z = trial.unknowns, evaluation.passes.z  # whose passes are kept
     apart = find_blocked(evaluation, unknowns.low, unknowns.high)  # a bound takes the place of a zero gradient
     apart[places] = True
+    apart[[unknowns.names.index(name) for name in neutral]] = True
     kept = np.flatnonzero(~apart)
     hessian = evaluation.hessian
     if not trial.loss.quadratic:

@@ -220,11 +220,22 @@ class FitExperiment:
         """Run the pass of one segment."""
         return run_passes(self.model, segment.samples, self.point(z), segment.start(z), self.weights, **keep)
 
+    def simulates_alike(self, z: Vector, wider: FitExperiment, at: Float[np.ndarray, " m"]) -> bool:
+        """Tell whether the same experiment with more unknowns has the same states, in the same steps."""
+        (ours, theirs), (point, other) = (self.model, wider.model), (self.point(z), wider.point(at))
+        return (
+            (ours.linear, tuple(ours.plant.states)) == (theirs.linear, tuple(theirs.plant.states))
+            and (point.substeps, point.stable, point.halved) == (other.substeps, other.stable, other.halved)
+            and all(a.samples.shares is b.samples.shares for a, b in zip(self.segments, wider.segments, strict=True))
+        )
+
     def keep_within(self, z: Vector, wider: FitExperiment, at: Float[np.ndarray, " m"]) -> None:
-        """Make the passes of the same experiment with more unknowns, and keep those at z as a part of them."""
-        point, other = self.point(z), wider.point(at)
-        if (point.substeps, point.stable, point.halved) != (other.substeps, other.stable, other.halved):
+        """Make the passes of the same experiment with more unknowns, and keep those at z as a part of them, where it
+        simulates alike.
+        """
+        if not self.simulates_alike(z, wider, at):
             return
+        point, other = self.point(z), wider.point(at)
         free, delays = wider.model.free, [point.clock.delay_free, other.clock.delay_free]
         columns = [0, *(1 + free.index(name) for name in self.model.free), *([1 + len(free)] if delays[0] else [])]
         for segment, larger in zip(self.segments, wider.segments, strict=True):

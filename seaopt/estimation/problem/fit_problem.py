@@ -154,6 +154,11 @@ class FitProblem:
         if not self.predicts and sum(e.count_bytes() for e in wider.experiments) <= measure_room():
             self.map(lambda experiment: experiment.keep_within(z, there[experiment.name], at))
 
+    def simulates_alike(self, z: Vector, wider: FitProblem, at: Float[np.ndarray, " m"]) -> bool:
+        """Tell whether the same problem with more unknowns simulates each experiment as this one does at z."""
+        there = {experiment.name: experiment for experiment in wider.experiments}
+        return all(experiment.simulates_alike(z, there[experiment.name], at) for experiment in self.experiments)
+
     def evaluate(self, z: Vector) -> Evaluation:
         """Return cost, gradient and Hessian at the best linear unknowns; infinite if it overflows or is too stiff."""
         if count_left() < 1.0:

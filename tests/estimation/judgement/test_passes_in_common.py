@@ -9,6 +9,7 @@ from seaopt.estimation.judgement.score_test import free_fixed
 from seaopt.estimation.problem.fit_problem import FitProblem, pose_problem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.simulation import keep_passes
+from seaopt.simulation.compiled import Program
 
 STAND = so.plants.high_impedance()
 
@@ -50,3 +51,25 @@ def test_a_part_is_the_pass(name, monkeypatch):
     assert np.max(np.abs(part.columns - alone.columns) / (np.max(np.abs(alone.columns), axis=0) + 1e-300)) < 1e-9
     assert part.outputs == pytest.approx(alone.outputs, rel=1e-11, abs=1e-9)
     assert (part.count == alone.count).all()
+
+
+@pytest.mark.parametrize("f_c", [0.0, 60.0])
+def test_a_right_model_is_judged_by_one_more_pass(f_c, monkeypatch):
+    """With the parameters that were fixed, and with the effects that a log may not show."""
+    problem = pose(f_c)
+    made: list[tuple[str, ...]] = []
+    for name in ("run", "run_halves"):
+        real = getattr(Program, name)
+
+        def run(program, *args, real=real, **options):
+            made.append(program.model.free)
+            return real(program, *args, **options)
+
+        monkeypatch.setattr(Program, name, run)
+    so.fit([e.data for e in problem.experiments], problem.params, diagnostics=False)
+    bare = len(made)
+    made.clear()
+    fit = so.fit([e.data for e in problem.experiments], problem.params)
+    assert fit.met
+    assert len(made) == bare + 1
+    assert {"k", "K_tau", "c_t", "d_e"} < set(made[-1])
