@@ -31,8 +31,8 @@ LOSSES = ("square", "huber", "soft_l1")
 
 
 _INFLUENCES = (
-    (np.int64, ("lags", "parts", "outputs_of", "columns_in")),
-    (np.uint64, ("into", "correlation", "ring", "form")),
+    (np.int64, ("lags", "parts", "outputs_of", "columns_in", "forms")),
+    (np.uint64, ("places", "into", "correlation", "ring", "form")),
 )
 _FIELDS = (  # of seaopt_pass_args behind its channels; pointers are whole numbers
     (np.int64, ("from", "to", "length", "lead", "shared", "drift_terms", "v_columns", "lag_a", "lag_b", "lag_c")),
@@ -159,39 +159,41 @@ def _load_sums() -> ctypes.CDLL | None:
 
 
 def double_sum_of_columns(
-    columns: Float[np.ndarray, "n ny nc"], counted: Bool[np.ndarray, "n ny"], into: Influence, r: Lagged
+    made: Pass, counted: Bool[np.ndarray, "n ny"], into: Influence, r: Lagged, *, forms: int
 ) -> DoubleSum | None:
-    """Return what `Program.double_sum` does, of columns that are there."""
+    """Return what `Program.double_sum` does, of a pass whose columns are there."""
     sums = _load_sums()
-    if sums is None:
+    if sums is None or made.columns is None:
         return None
-    arguments, buffers, form = _lay_out_influences(
-        into, r, np.zeros(1, dtype=[(n, k) for k, ns in _INFLUENCES for n in ns])
-    )
-    chosen, v = np.ascontiguousarray(counted, dtype=np.int32), np.ascontiguousarray(columns)
+    places = np.arange(into.shape[2]) if made.chosen is None else made.chosen
+    empty = np.zeros(1, dtype=[(n, k) for k, ns in _INFLUENCES for n in ns])
+    arguments, buffers, form = _lay_out_influences(into, places, r, empty, forms)
+    chosen, v = np.ascontiguousarray(counted, dtype=np.int32), np.ascontiguousarray(made.columns)
     pointers = (ctypes.c_void_p(array.ctypes.data) for array in (arguments, v, chosen))
-    sums.seaopt_sum_twice(*pointers, ctypes.c_long(len(v)))
+    sums.seaopt_sum_twice(*pointers, ctypes.c_long(len(v)), ctypes.c_long(v.shape[2]))
     del buffers
     return _halve_form(form, into.shape[1])
 
 
-def _lay_out_influences(into: Any, r: Any, arguments: Any) -> tuple[Any, Any, Any]:
-    """Return arguments with the influences in them, the memory that they point to, and what is summed, by argument."""
-    ny, p, nc = into.shape
-    width = _pad_to_vectors(p)
-    padded, halved = np.zeros((ny, nc, width)), np.array(r, order="C")
-    padded[:, :, :p] = into.transpose(0, 2, 1)
-    halved[0] *= 0.5
-    ring, form = np.zeros((len(arguments), 2 * len(r), ny, width)), np.zeros((len(arguments), 2, width, width))
-    arguments["lags"], arguments["parts"], arguments["outputs_of"], arguments["columns_in"] = (
-        len(r) - 1,
-        width // 4,
-        ny,
-        nc,
+def _lay_out_influences(into: Any, places: Any, r: Any, arguments: Any, forms: int) -> tuple[Any, Any, Any]:
+    """Return arguments with the influences in them, the memory that they point to, and what is summed, by argument.
+    Columns without influence are left out.
+    """
+    moves = np.flatnonzero(np.any(into != 0.0, axis=(0, 1)))
+    ny, p, width = len(into), into.shape[1], _pad_to_vectors(into.shape[1])
+    padded, halved, rows = (
+        np.zeros((ny, moves.size, width)),
+        np.array(r, order="C"),
+        np.asarray(places[moves], np.int64),
     )
-    arguments["into"], arguments["correlation"] = padded.ctypes.data, halved.ctypes.data
-    arguments["ring"], arguments["form"] = row_addresses(ring), row_addresses(form)
-    return arguments, (padded, halved, ring, form), form
+    padded[:, :, :p] = into[:, :, moves].transpose(0, 2, 1)
+    halved[0] *= 0.5
+    ring, form = np.zeros((len(arguments), 2 * len(r), ny, width)), np.zeros((len(arguments), forms, width, width))
+    sizes = {"lags": len(r) - 1, "parts": width // 4, "outputs_of": ny, "columns_in": moves.size, "forms": forms}
+    pointed = {"places": rows.ctypes.data, "into": padded.ctypes.data, "correlation": halved.ctypes.data}
+    for name, value in {**sizes, **pointed, "ring": row_addresses(ring), "form": row_addresses(form)}.items():
+        arguments[name] = value
+    return arguments, (rows, padded, halved, ring, form), form
 
 
 def _halve_form(form: Any, p: int) -> DoubleSum:
@@ -382,11 +384,15 @@ class Program:
         width = _pad_to_vectors(self.layout.states)
         return carried[: self.model.nx * width].reshape(-1, width)[:, : self.layout.states]
 
-    def double_sum(self, x0: VectorX, into: Influence, r: Lagged) -> DoubleSum:
-        """Return the sum over t, s of a(t)' R(t - s) a(s), and its part t = s; a: influences that count into v."""
+    def double_sum(self, x0: VectorX, into: Influence, r: Lagged, *, forms: int) -> DoubleSum:
+        """Return the sum over t, s of a(t)' R(t - s) a(s), and of two forms its part t = s; a: influences that count
+        into v.
+        """
         edges, starts, warm = self._split(0, self.segment.n, x0, halve=True)
         warm[1:] += len(r)  # influences reach so far back
-        arguments, influences, form = _lay_out_influences(into, r, self._place(edges, warm, x0=starts))
+        arguments, influences, form = _lay_out_influences(
+            into, np.arange(into.shape[2]), r, self._place(edges, warm, x0=starts), forms
+        )
         self.kernel.run(arguments, (self.memory, starts, influences), parallel=self.segment.n >= PARALLEL)
         return _halve_form(form, into.shape[1])
 

@@ -21,7 +21,7 @@ MAX_SECTIONS = 8  # as in layout.h
 SLACK = 1e-9  # of a step: rounding of a share
 RobustLoss = Literal["square", "huber", "soft_l1"]
 Influence = Float[np.ndarray, "ny p nc"]  # of the column v of an output on p estimates
-DoubleSum = Float[np.ndarray, "2 p p"]  # over all t and s, and over t = s
+DoubleSum = Float[np.ndarray, "forms p p"]  # over all t and s, and where asked for over t = s
 Lagged = Float[np.ndarray, "lags1 ny ny"]  # R(k) of outputs, a lag each
 
 

@@ -253,7 +253,15 @@ def stream(
 
 
 def double_sum(
-    model: Model, segment: Segment, point: Point, x0: VectorX, weights: Weights, into: Influence, r: Lagged
+    model: Model,
+    segment: Segment,
+    point: Point,
+    x0: VectorX,
+    weights: Weights,
+    into: Influence,
+    r: Lagged,
+    *,
+    forms: int = 2,
 ) -> DoubleSum | None:
     """Return the sum over t and s of a(t)' R(t - s) a(s), and of it what t = s gives; None where there is no compiler.
 
@@ -267,16 +275,14 @@ def double_sum(
         Takes the column v of an output to its influence a on p estimates; its first column is zero.
     r : array, shape (lags + 1, ny, ny)
         R(k)[a, b] of output a with output b so many samples before; R(-k) = R(k)'. Time grows with the lags.
+    forms : int
+        1 leaves out what t = s gives.
     """
     store = _kept.get()
     kept = store and store.find(_key(model, segment, point, x0, weights), 0, columns=True)
     if not kept or kept.columns is None:
         program = Program.make(model, segment, point, weights)
-        return None if program is None else program.double_sum(x0, into, r)
+        return None if program is None else program.double_sum(x0, into, r, forms=forms)
     _, counted = read_measured(segment, segment.n)
     counted[: weights.settle] = False
-    if kept.chosen is not None:
-        among = np.zeros((*into.shape[:2], kept.columns.shape[2]))
-        among[:, :, kept.chosen] = into
-        into = among
-    return double_sum_of_columns(kept.columns, counted, into, r)
+    return double_sum_of_columns(kept, counted, into, r, forms=forms)

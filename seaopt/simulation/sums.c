@@ -41,14 +41,14 @@ static void add_gram(const double *sum, long width, double *gram, long columns) 
 }
 
 /* The ring holds each influence twice, so that those of the last lags always stand in a row. */
-INLINE void influence(const influences *a, double *const *v, const int *present, long slot, int counts, long ny) {
+INLINE void influence(const influences *a, double *const *v, const int *present, long slot, int counts, long ny, int both) {
     const long size = a->lags + 1, parts = a->parts;
     loose *const here = (loose *)a->ring + (slot + size) * ny * parts, *const again = here - size * ny * parts;
     const loose *into = (const loose *)a->into;
     for (long o = 0; o < ny; o++)
         for (long j = 0; j < parts; j++) {
             loose sum = {0.0, 0.0, 0.0, 0.0};
-            for (long c = 1; present[o] && c < a->columns; c++) sum += v[o][c] * into[(o * a->columns + c) * parts + j];
+            for (long c = 0; present[o] && c < a->columns; c++) sum += v[o][a->places[c]] * into[(o * a->columns + c) * parts + j];
             here[o * parts + j] = again[o * parts + j] = sum;
         }
     for (long j = 0; j < parts && counts; j++) {
@@ -58,7 +58,7 @@ INLINE void influence(const influences *a, double *const *v, const int *present,
         for (long lag = 0; lag < size; lag++, r += ny * ny) {
             for (long o = 0; o < ny; o++)
                 for (long b = 0; b < ny; b++) sum[o][b] += r[o * ny + b] * here[(b - lag * ny) * parts + j];
-            for (long o = 0; lag == 0 && o < ny; o++) {
+            for (long o = 0; lag == 0 && both && o < ny; o++) {
                 now[o] = sum[o][0];
                 for (long b = 1; b < ny; b++) now[o] += sum[o][b];
             }
@@ -68,23 +68,24 @@ INLINE void influence(const influences *a, double *const *v, const int *present,
             for (long i = 0; i < 4 * parts; i++) {
                 const double one = ((const double *)(here + o * parts))[i];
                 ((loose *)a->form)[i * parts + j] += one * sum[o][0];
-                ((loose *)a->form)[(4 * parts + i) * parts + j] += one * now[o];
+                if (both) ((loose *)a->form)[(4 * parts + i) * parts + j] += one * now[o];
             }
         }
     }
 }
 
 static void add_influence(const influences *a, double *const *v, const int *present, long slot, int counts) {
-    if (a->outputs == 1) influence(a, v, present, slot, counts, 1);
-    else if (a->outputs == 2) influence(a, v, present, slot, counts, 2);
-    else influence(a, v, present, slot, counts, a->outputs);
+    if (a->forms == 2) influence(a, v, present, slot, counts, a->outputs, 1);
+    else if (a->outputs == 1) influence(a, v, present, slot, counts, 1, 0);
+    else if (a->outputs == 2) influence(a, v, present, slot, counts, 2, 0);
+    else influence(a, v, present, slot, counts, a->outputs, 0);
 }
 
-/* The double sum over columns that are kept: samples x outputs x columns, of which those that are counted take part. */
-EXPORTED void seaopt_sum_twice(const influences *a, const double *columns, const int *counted, long samples) {
+/* The double sum over columns that are kept: samples x outputs x width, of which those that are counted take part. */
+EXPORTED void seaopt_sum_twice(const influences *a, const double *columns, const int *counted, long samples, long width) {
     const double *v[a->outputs];
     for (long k = 0; k < samples; k++) {
-        for (long o = 0; o < a->outputs; o++) v[o] = columns + (k * a->outputs + o) * a->columns;
+        for (long o = 0; o < a->outputs; o++) v[o] = columns + (k * a->outputs + o) * width;
         add_influence(a, (double *const *)v, counted + k * a->outputs, k % (a->lags + 1), 1);
     }
 }

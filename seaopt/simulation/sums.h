@@ -7,10 +7,12 @@ typedef double loose __attribute__((vector_size(32), may_alias, aligned(8))); /*
 
 typedef struct {
     long lags, parts, outputs, columns; /* parts: vectors of estimates */
-    const double *into;                 /* outputs x columns x 4 parts: takes v to its influence on so many estimates */
+    long forms;                         /* 2: the double sum and its part t = s; 1: the double sum alone */
+    const long *places;                 /* columns: of v, those that have an influence */
+    const double *into;                 /* outputs x columns x 4 parts: takes them to their influence on so many estimates */
     const double *correlation;          /* (1 + lags) x outputs x outputs: R(k), R(0) halved */
     double *ring;                       /* 2 (1 + lags) x outputs x 4 parts: influences of the last samples, zero at first */
-    double *form;                       /* 2 x 4 parts x 4 parts, added to: half the double sum of a(t)' R(t - s) a(s), and
+    double *form;                       /* forms x 4 parts x 4 parts, added to: half the double sum of a(t)' R(t - s) a(s), and
                                            of it what t = s gives */
 } influences;
 

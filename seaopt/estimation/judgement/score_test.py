@@ -125,7 +125,7 @@ def run_score_tests(minimum: Minimum, freed: Freed | None = None) -> dict[str, S
     statistics = minimum.statistics or compute_statistics(trial, z)
     neutral = [each.parameter.name for each in freed.additions]
     score, information, variance = _compute_scores(trial, evaluation, places, neutral, statistics)
-    chosen = np.flatnonzero((information > REDUNDANT * np.diag(evaluation.hessian)[places]) & (variance > 0.0))
+    chosen = np.flatnonzero(variance > 0.0)
     order = sorted(chosen, key=lambda i: score[i] ** 2 / information[i], reverse=True)
     rows = list(units.items())
     return {
@@ -182,8 +182,8 @@ def _compute_scores(
     neutral: Sequence[str],
     statistics: StatisticsByExperiment,
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return scores, their information, and their variances with the residuals as coloured as they are. `neutral`:
-    unknowns that stay where they are.
+    """Return scores, their information, and their variances with the residuals as coloured as they are, zero of what
+    the free ones stand for. `neutral`: unknowns that stay where they are.
     """
     unknowns, z = trial.unknowns, evaluation.passes.z  # whose passes are kept
     apart = find_blocked(evaluation, unknowns.low, unknowns.high)  # a bound takes the place of a zero gradient
@@ -196,7 +196,9 @@ def _compute_scores(
     across = solve_seen(hessian[kept][:, kept], hessian[kept][:, places], 1e-12)
     score = evaluation.gradient[places] - across.T @ evaluation.gradient[kept]
     information = np.diag(hessian)[places] - np.sum(hessian[kept][:, places] * across, axis=0)
-    along = np.zeros((z.size, places.size))
-    along[kept], along[places, np.arange(places.size)] = -across, 1.0
-    meat = compute_meat(trial, z, along, statistics)
-    return score, information, np.diag(meat + (along.T * unknowns.precision) @ along)
+    told = np.flatnonzero(information > REDUNDANT * np.diag(evaluation.hessian)[places])
+    along, variance = np.zeros((z.size, told.size)), np.zeros(places.size)
+    along[kept], along[places[told], np.arange(told.size)] = -across[:, told], 1.0
+    if told.size:
+        variance[told] = np.diag(compute_meat(trial, z, along, statistics) + (along.T * unknowns.precision) @ along)
+    return score, information, variance

@@ -124,27 +124,32 @@ def compute_meat(
         r, last = estimate_correlations(sums)
         places = np.concatenate([at for segment in experiment.segments for at in experiment.columns(segment)])
         seen = np.unique(places[places >= 0])
+        forms = 2 if np.max(sums.count) < SHORT_LOG and not last else 1
         if seen.size < p:  # one of many logs: its few unknowns move all that is asked for
             basis = np.zeros((len(inverse), seen.size))
             basis[seen, np.arange(seen.size)] = 1.0
-            meat, together = inverse[seen].T @ _sum_twice(experiment, z, basis, r) @ inverse[seen]
+            meats = inverse[seen].T @ _sum_twice(experiment, z, basis, r, forms) @ inverse[seen]
         else:
-            meat, together = _sum_twice(experiment, z, inverse, r)
-        total += _at_least(meat, together) if np.max(sums.count) < SHORT_LOG and not last else meat
+            meats = _sum_twice(experiment, z, inverse, r, forms)
+        total += meats[0] if forms == 1 else _at_least(*meats)
     return total
 
 
 def _sum_twice(
-    experiment: FitExperiment, z: Vector, inverse: Float[np.ndarray, "n p"], r: Float[np.ndarray, "lags1 ny ny"]
-) -> Float[np.ndarray, "2 p p"]:
-    """Return one experiment's part of the double sum, and of that what t = s gives."""
-    total = np.zeros((2, *(inverse.shape[1],) * 2))
+    experiment: FitExperiment,
+    z: Vector,
+    inverse: Float[np.ndarray, "n p"],
+    r: Float[np.ndarray, "lags1 ny ny"],
+    forms: int,
+) -> Float[np.ndarray, "forms p p"]:
+    """Return one experiment's part of the double sum, and of two forms of that what t = s gives."""
+    total = np.zeros((forms, *(inverse.shape[1],) * 2))
     reach, chunk = len(r) - 1, max(CACHED_SAMPLES, 4 * len(r))
     pairs = [(segment, map_to_influence(experiment, segment, inverse)) for segment in experiment.segments]
     if reach <= COMPILED_LAGS:
         point, weights = experiment.point(z), experiment.weights
         sums = [
-            double_sum(experiment.model, segment.samples, point, segment.start(z), weights, into, r)
+            double_sum(experiment.model, segment.samples, point, segment.start(z), weights, into, r, forms=forms)
             for segment, into in pairs
         ]
         if all(part is not None for part in sums):
@@ -156,7 +161,9 @@ def _sum_twice(
         for _, columns, used in stream_columns(experiment, segment, z, chunk):
             now = compute_influence(columns, used, into)
             with_tail = np.concatenate([tail, now], axis=2)
-            total += whole(with_tail) - twice(tail), together(now)
+            total[0] += whole(with_tail) - twice(tail)
+            if forms == 2:
+                total[1] += together(now)
             tail = with_tail[:, :, max(with_tail.shape[2] - reach, 0) :]
     return total
 
