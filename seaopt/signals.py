@@ -33,6 +33,16 @@ TARGET_LOG = "SEALOG1"  # with which a log begins that the C beside a law writes
 REFERENCES = (REFERENCE, "ref")  # what its column is called where nobody says
 
 
+def median(values: VectorN) -> float:
+    """Return the median of numbers, NaN where one is none: NumPy's takes ten times as long to find both middle ones."""
+    middle = values.size // 2
+    if not values.size or np.isnan(np.sum(values)):
+        return float(np.median(values))
+    ordered = np.partition(values, middle)
+    upper = float(ordered[middle])
+    return upper if values.size % 2 else 0.5 * (float(np.max(ordered[:middle])) + upper)
+
+
 @record
 class Origin:
     """Where a channel came from."""

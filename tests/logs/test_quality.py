@@ -22,7 +22,7 @@ from seaopt.logs.quality.clock import advise_clock, measure_steps, timestamp_res
 from seaopt.logs.quality.faults import count_repeats, find_quantisation, find_runs
 from seaopt.logs.quality.lags import correlate_channels
 from seaopt.logs.quality.spectra import compute_spectra
-from seaopt.signals import Signal
+from seaopt.signals import Signal, median
 
 GRAVE = ("error", "warning")
 
@@ -436,3 +436,16 @@ def test_the_lag_of_one_channel_behind_another():
     both = compute_spectra({"a": x[5:], "b": -x[:-5]}, [slice(0, 3995)], 0.01)
     pair = correlate_channels(both, "a", "b")
     assert pair.lag_s == pytest.approx(0.05, abs=1e-3) and pair.correlation < -0.9
+
+
+@pytest.mark.parametrize(
+    "values", [[3.0], [1.0, 4.0], [5.0, -1.0, 2.0, 2.0], [np.nan, 1.0, 2.0], [np.inf, 0.0, 1.0, np.inf]]
+)
+def test_the_median_is_numpys(values):
+    assert median(np.array(values)) == pytest.approx(np.median(values), nan_ok=True)
+
+
+def test_the_median_of_many_is_numpys():
+    for size in (1000, 1001):
+        values = np.random.default_rng(size).normal(size=size)
+        assert median(values) == np.median(values)

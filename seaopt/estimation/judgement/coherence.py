@@ -34,6 +34,7 @@ from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.estimation.result.model_error import bridge
 from seaopt.records import record
+from seaopt.signals import median
 
 STRETCHES = (16, 64)  # how many half-overlapping pairs of them the samples make
 SHORTEST = 32  # samples of a stretch
@@ -121,8 +122,8 @@ def _tame(error: Float[np.ndarray, "ny n"], used: Bool[np.ndarray, "ny n"]) -> F
     tamed = error.copy()
     for row, kept in zip(tamed, used, strict=True):
         if kept.any():
-            middle = float(np.median(row[kept]))
-            scale = OUTLIER * 1.4826 * float(np.median(np.abs(row[kept] - middle)))
+            middle = median(row[kept])
+            scale = OUTLIER * 1.4826 * median(np.abs(row[kept] - middle))
             if scale > 0.0:
                 np.clip(row, middle - scale, middle + scale, out=row)
     return tamed

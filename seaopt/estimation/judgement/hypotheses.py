@@ -221,7 +221,7 @@ class Addition:
     part: str
     parameter: Parameter
     size: float  # that actuators have
-    experiments: Mapping[str, Experiment]  # all of a fit, with its part and those of the additions before it
+    plants: Mapping[str, Plant]  # of all experiments of a fit, with its part and those of the additions before it
 
 
 def list_additions(problem: FitProblem, z: Vector) -> Iterator[Addition]:
@@ -230,39 +230,39 @@ def list_additions(problem: FitProblem, z: Vector) -> Iterator[Addition]:
     """
     fitted = (replace(problem.params[name], value=float(z[i])) for i, name in enumerate(problem.shared_names))
     params = problem.params.with_parameters(*fitted)
-    experiments = {experiment.name: experiment.data for experiment in problem.experiments}
+    data = {experiment.name: experiment.data for experiment in problem.experiments}
+    plants = {name: experiment.plant for name, experiment in data.items()}
     for hypothesis in HYPOTHESES:
         if hypothesis.usual is None:
             continue
-        changed, names = dict[str, Experiment](), set[str]()
-        for name, experiment in experiments.items():
-            if (built_in := hypothesis.built_in(experiment.plant)) is not None:
-                if built_in not in experiment.parameters:
-                    changed[name] = experiment
+        changed, names = dict[str, Plant](), set[str]()
+        for experiment, plant in plants.items():
+            if (built_in := hypothesis.built_in(plant)) is not None:
+                if built_in not in data[experiment].parameters:
+                    changed[experiment] = plant
                     names.add(built_in)
-            elif (plant := _add(experiment.plant, hypothesis.part)) is not None:
-                changed[name] = replace(experiment, plant=plant)
-                names |= plant.parameters.keys() - experiment.plant.parameters.keys()
+            elif (other := _add(plant, hypothesis.part)) is not None:
+                changed[experiment] = other
+                names |= other.parameters.keys() - plant.parameters.keys()
         if len(names) != 1:
             continue
         (name,) = names
-        first = next(iter(changed.values()))
-        parameter, spring = first.plant.parameters[name], first.plant.spring
-        is_there = name in experiments[first.name].plant.parameters
+        first, plant = next(iter(changed.items()))
+        parameter, spring, is_there = plant.parameters[name], plant.spring, name in plants[first].parameters
         if is_there:
             parameter = params[name]
         elif name in params:
             continue
         if not isinstance(parameter, Parameter) or parameter.free or spring is None or not spring.stiffness:
             continue
-        stiffness = first.plant.complete(first.apply_own(params))[spring.stiffness].value
-        experiments = experiments | changed
+        stiffness = plant.complete(data[first].apply_own(params))[spring.stiffness].value
+        plants = plants | changed
         yield Addition(
             effect=hypothesis.effect + (" more" if parameter.value else ""),
             part="" if is_there else hypothesis.part,
             parameter=parameter,
             size=hypothesis.usual(stiffness),
-            experiments=experiments,
+            plants=plants,
         )
 
 

@@ -19,6 +19,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -77,8 +78,12 @@ class Freed:
         """Return the problem in which parameters of these names are free, and the delays of experiments, from given
         values, under the name EXPERIMENT.delay_s; and with what is added.
         """
-        data = dict(additions[-1].experiments) if additions else {e.name: e.data for e in problem.experiments}
-        data |= {name: free_delay(data[name], value) for name, value in (delays or {}).items()}
+        changes: dict[str, dict[str, Any]] = {e.name: {} for e in problem.experiments}
+        for name, plant in additions[-1].plants.items() if additions else ():
+            changes[name]["plant"] = plant
+        for name, value in (delays or {}).items():
+            changes[name]["delay_s"] = _make_delay(value)
+        data = {e.name: replace(e.data, **changes[e.name]) for e in problem.experiments if changes[e.name]}
         added = (replace(addition.parameter, free=True) for addition in additions)
         params = free_more(problem.params, names).with_parameters(*added)
         freed, at = problem.rebuild(params, z, data)
@@ -150,7 +155,11 @@ def _test(value: float, unit: str, score: float, information: float, variance: f
 
 def free_delay(experiment: Experiment, value: float) -> Experiment:
     """Return the experiment with a free delay that starts at a value."""
-    return replace(experiment, delay_s=Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0))
+    return replace(experiment, delay_s=_make_delay(value))
+
+
+def _make_delay(value: float) -> Parameter:
+    return Parameter(name="delay_s", value=value, unit="s", free=True, min=0.0)
 
 
 def find_candidates(problem: FitProblem) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -44,6 +44,7 @@ from seaopt.estimation.problem.rounding import Rounding, equate
 from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal, Vector
 from seaopt.estimation.result.covariance import compute_bread, compute_influence, map_to_influence, take_root
 from seaopt.records import record
+from seaopt.signals import median
 
 PARTS = 8
 HALVES = 3  # by time, by amplitude, by speed
@@ -338,7 +339,7 @@ def _split(
         effort.append(_measure_envelope(model[:, find_effort(experiment.data)], experiment.period))
         fast.append(_measure_speed(experiment, model))
     used = np.concatenate(counted)
-    middles = [float(np.nanmedian(np.concatenate(parts)[used])) for parts in (effort, fast)]
+    middles = [_find_middle(np.concatenate(parts)[used]) for parts in (effort, fast)]
     masks: list[Bool[np.ndarray, "halves n"]] = []
     first, samples = 0, int(np.count_nonzero(used))
     for envelope, speed, mask in zip(effort, fast, counted, strict=True):
@@ -361,9 +362,14 @@ def find_effort(experiment: Experiment) -> int:
     return next((outputs.index(name) for name in regulated if name in outputs), 0)
 
 
+def _find_middle(values: Signal) -> float:
+    """Return the median of the samples that are there."""
+    return median(values[~np.isnan(values)])
+
+
 def _measure_envelope(values: Signal, period: float) -> Signal:
     """Return the largest distance from the median within 0.25 s; NaN where samples are missing."""
-    away = np.abs(values - np.nanmedian(values)) if np.any(np.isfinite(values)) else np.zeros_like(values)
+    away = np.abs(values - _find_middle(values)) if np.any(np.isfinite(values)) else np.zeros_like(values)
     width, length = max(1, round(ENVELOPE_S / period)), 1
     largest = np.pad(np.nan_to_num(away), (width // 2, width - 1 - width // 2))
     while length < width:  # the largest of ever longer stretches from each sample on

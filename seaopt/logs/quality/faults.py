@@ -25,6 +25,7 @@ NEIGHBOURS = 5  # samples each side of an outlier that it is compared with
 HOLDS = 0.4  # share of still samples from which a channel may be one that is held
 REGULAR = 0.8  # share of a counter's, or a held channel's, steps that must be alike
 LARGEST_COUNT = 2.0**53  # below which a float is every whole number
+FEW_APART = 2_000  # distances that are enough to see that half of them are no multiples of a step
 FEWEST_SAMPLES = 16  # samples below which nothing is judged
 
 
@@ -96,22 +97,35 @@ def measure_stillness(values: VectorN) -> float:
 def find_quantisation(values: VectorN) -> float:
     """Return the step whose multiples the samples are; 0 where there is none."""
     stride = max(1, values.size // LEVEL_SAMPLES)
-    kinds = np.unique(values[::stride][np.isfinite(values[::stride])])
-    if kinds.size < 3 or values.size < FEWEST_SAMPLES:
-        return 0.0
+    kinds = np.sort(values[::stride][np.isfinite(values[::stride])])
     apart = np.diff(kinds)
+    if np.count_nonzero(apart) < 2 or values.size < FEWEST_SAMPLES:
+        return 0.0
     apart = apart[apart > 1e-9 * float(kinds[-1] - kinds[0])]
     if not (apart.size and np.isfinite(apart).all()):  # numbers near the largest float have no differences
         return 0.0
     least = float(np.min(apart))
     # The least difference may be several steps where a level next to another never occurs.
+    some = apart[:: max(1, apart.size // FEW_APART)]  # of a channel without a step they tell so
     for parts in (1, 2, 3, 4, 5):
         step = least / parts
-        counts = np.round(apart / step)
-        step = float(np.sum(apart * counts) / np.sum(counts**2))
-        if np.mean(np.abs(apart / step - np.round(apart / step)) < 0.05) > 0.98:
+        if _count_near(some, _refine(some, step)) < 0.5:
+            continue
+        step = _refine(apart, step)
+        if _count_near(apart, step) > 0.98:
             return step
     return 0.0
+
+
+def _refine(apart: VectorK, step: float) -> float:
+    """Return the step of which distances are multiples, in the mean."""
+    counts = np.round(apart / step)
+    return float(np.sum(apart * counts) / np.sum(counts**2))
+
+
+def _count_near(apart: VectorK, step: float) -> float:
+    """Return the share of distances that are nearly multiples of a step."""
+    return float(np.mean(np.abs(apart / step - np.round(apart / step)) < 0.05))
 
 
 def find_outliers(values: VectorN, quantum: float) -> RowsK:
