@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import field
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -244,7 +245,8 @@ def _sum_parts(
     found, effect = dict[str, tuple[ParameterMatrix, ParameterMatrix]](), np.zeros(q)
     every, known = list[Rounding](), list[Rounding]()
     masks = {
-        e.name: [np.any(s.mark_counted(e.weights.settle), axis=1) for s in e.segments] for e in problem.experiments
+        e.name: [reduce(np.logical_or, s.mark_counted(e.weights.settle).T) for s in e.segments]
+        for e in problem.experiments
     }
     samples = sum(int(np.count_nonzero(mask)) for rows in masks.values() for mask in rows)
     before = 0
@@ -263,7 +265,7 @@ def _sum_parts(
             for rows, columns, used in stream_columns(experiment, segment, z):
                 along = compute_influence(columns, used, into)
                 r = (columns[:, :, 0] / experiment.sigma).T
-                weighted = along * loss.curvature(r)[:, None, :]
+                weighted = along if loss.quadratic else along * loss.curvature(r)[:, None, :]
                 scores = np.sum(along * loss.slope(r)[:, None, :], axis=0)
                 part = np.minimum(order[rows] * PARTS // samples, PARTS - 1)
                 for k in range(int(part[0]), int(part[-1]) + 1):
