@@ -58,9 +58,10 @@ checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=
 sys.modules["seaopt_type_checker"] = checker
 
 EVERY = 200
-numbers: dict[tuple[str, str, CodeType], int] = {}  # a hash of the code itself at every call takes longer than most
-calls: defaultdict[int, int] = defaultdict(int)
-made: dict[int, FunctionType] = {}  # checks of functions inside others: making one takes longer than many calls
+Key = tuple[str, str, CodeType]
+left: defaultdict[Key, list[int]] = defaultdict(lambda: [0])  # calls of a function until one that is checked
+begun: list[list[int]] = []  # those of this test
+made: dict[Key, FunctionType] = {}  # checks of functions inside others: making one takes longer than many calls
 
 
 def make_checked(function):
@@ -99,19 +100,21 @@ def check_calls(function):
     if inspect.isgeneratorfunction(function):  # checked where it is first advanced, among somebody else's shapes
         return function
     key = (function.__module__, function.__qualname__, function.__code__)  # constructors of records may have equal code
-    number, checked = numbers.setdefault(key, len(numbers)), None
+    wait, checked = left[key], None
 
     @functools.wraps(function)
     def call(*args, **kwargs):
         nonlocal checked
-        calls[number] = count = calls[number] + 1
-        if count > 1 and count % EVERY:
+        if wait[0] > 0:
+            wait[0] -= 1
             return function(*args, **kwargs)
+        wait[0] = EVERY - 2
+        begun.append(wait)
         if checked is None:
-            before = made.get(number)
+            before = made.get(key)
             checked = make_checked(function) if before is None else bind(before, function)
             if before is None and checked is not function and "<locals>" in function.__qualname__:
-                made[number] = checked
+                made[key] = checked
         with shapes_of_one_call():
             return checked(*args, **kwargs)
 
@@ -125,7 +128,9 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup() -> None:
     """Count calls anew, so that what a test checks does not depend on the tests before it."""
-    calls.clear()
+    for wait in begun:
+        wait[0] = 0
+    begun.clear()
 
 
 shapes_of_one_call = partial(jaxtyping.jaxtyped, "context")
