@@ -230,8 +230,8 @@ def _find_moves(values: Signal) -> tuple[int, int]:
     power -= rest  # of a reading's noise
     moves = power > MOVES * np.max(power)
     square = rest / blocks[0].size  # of what changes from sample to sample: twice the variance of what is white
-    white = float(np.median([np.var(block) for block in blocks])) <= square
-    if 0.0 < 0.5 * square <= (READING * largest) ** 2 and white:
+    small = 0.0 < 0.5 * square <= (READING * largest) ** 2
+    if small and float(np.median([np.var(block) for block in blocks])) <= square:  # white
         means = np.diff([float(np.mean(block)) for block in blocks], prepend=float(np.mean(blocks[0])))
         spread = 1.4826 * float(np.median(np.abs(power - np.median(power))))
         moves &= power > LOUD * spread
