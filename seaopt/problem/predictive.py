@@ -36,6 +36,12 @@ def _check_keys(table: ProblemTable, controller: ControllerTable) -> None:
     if all(name.startswith(RESPONSE) for name in controller.robust_to):  # which its linear region is certified on
         taken.add("robust_to")
     stated = sorted(controller.model_fields_set - taken)
+    terms = controller.compensation
+    if stated[:1] == ["compensate"] and terms.gravity is not None and terms.friction is None and terms.ripple is None:
+        raise ProblemError(
+            'controller.compensate.gravity adds to the reference, and structure = "mpc" takes it as it is given: no '
+            "plan runs with it, so that nothing is shown of the loop that it closes; take it out, or take gains"
+        )
     if stated and stated[0] in ADDED:
         raise ProblemError(
             f"controller.{stated[0]} adds to the command behind the law, and a plan keeps limits and rate of the "
