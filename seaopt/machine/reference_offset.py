@@ -1,9 +1,9 @@
 r"""An offset of a reference that is logged in coarse steps, where a log tells it from what rounding leaves.
 
 Integrals run up the mean of rounding as they do an offset. With w what the estimate of the offset weighs each command
-with, an error in row j of what the law saw adds :math:`g_j = \sum_k w_k h_{k-j}` to it, h the law's response to one
-row; where the reference repeats, so does the error. An offset above four std of that is no rounding: digits that are
-cut off make one of half a step.
+with, an error in row j of what the law saw adds :math:`g_j = \sum_k w_k h_{kj}` to it, h what the law makes of one row,
+with its limit as logged; where the reference repeats, so does the error. An offset above four std of that is no
+rounding: digits that are cut off make one of half a step.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from jaxtyping import Bool, Float
 
+from seaopt.control import RunnableLaw
 from seaopt.machine.response.periods import find_period
-from seaopt.machine.stepped import Match, Setting, find_at_limit, list_impulses, list_steps, transform
+from seaopt.machine.stepped import Match, Setting, find_at_limit, find_steady, list_steps
 from seaopt.records import record
 
 SIGMAS = 4.0
@@ -34,10 +36,11 @@ def tell_offset(setting: Setting, match: Match) -> Offset | None:
     ticks, log = setting.ticks, setting.log or setting.ticks
     if not match.offset:
         return None
-    n, steps, impulses = len(ticks), list_steps(log), list_impulses(setting.linear, len(ticks))
-    steady = np.where(find_at_limit(ticks, setting.linear), 0.0, np.cumsum(impulses[0]))
+    law, steps, n = setting.linear, list_steps(log), len(ticks)
+    limited = find_at_limit(ticks, law)
+    steady = np.where(limited, 0.0, find_steady(law, limited))
     weights = steady / (steady @ steady)
-    seen = np.fft.irfft(np.conj(transform(impulses.T)) * transform(weights[:, None]), axis=0)[:n]
+    seen = _weigh_rows(law, limited, weights)
     phase = np.arange(n) % (find_period(ticks.reference) or n)
     squares = [float(np.sum(np.bincount(phase, each) ** 2)) for each in seen.T]
     variance = float(steps**2 @ squares + log.quantum**2 * np.sum(weights**2)) / 12.0
@@ -49,3 +52,20 @@ def tell_offset(setting: Setting, match: Match) -> Offset | None:
         step=float(steps[0]),
         or_reading=bool(np.any(steps[1:] > abs(match.offset))),
     )
+
+
+def _weigh_rows(
+    law: RunnableLaw, limited: Bool[np.ndarray, " n"], weights: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n k"]:
+    """Return what a weighted sum of a law's commands changes by with the reference, and with each reading, in a row."""
+    columns = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
+    direct = np.append(law.d_reference, -np.ravel(law.d_measurement))
+    back = law.anti_windup[:, None]
+    ways = (law.a, columns), (law.a - back * law.c, columns - back * direct)
+    seen, later = np.empty((limited.size, direct.size)), np.zeros(law.c.size)
+    for k, at_limit in reversed(list(enumerate(limited.tolist()))):
+        way, drive = ways[int(at_limit)]
+        weight = law.per_effort * weights[k]
+        seen[k] = weight * direct + later @ drive
+        later = weight * law.c + later @ way
+    return seen

@@ -340,14 +340,34 @@ def find_at_limit(ticks: Ticks, law: RunnableLaw) -> Bool[np.ndarray, " n"]:
 
 def find_modes(law: RunnableLaw, limited: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n m"]:
     """Return what each state at the first row adds to the later commands, with the limit as logged."""
-    rows, moved = np.empty((limited.size, law.c.size)), np.eye(law.c.size)
-    ways = law.a, law.a - np.outer(law.anti_windup, law.c)
+    return law.per_effort * _list_modes(law.a, law.c, law.anti_windup, limited)
+
+
+def find_steady(law: RunnableLaw, limited: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return what a reference of one adds to the commands from the first row on, with the limit as logged: that of one
+    more state, which stays.
+    """
+    n = law.c.size
+    way = np.block([[law.a, law.b_reference[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
+    modes = _list_modes(way, np.append(law.c, law.d_reference), np.append(law.anti_windup, 0.0), limited)
+    return law.per_effort * modes[:, -1]
+
+
+def _list_modes(
+    way: Float[np.ndarray, "m m"],
+    row: Float[np.ndarray, " m"],
+    anti_windup: Float[np.ndarray, " m"],
+    limited: Bool[np.ndarray, " n"],
+) -> Float[np.ndarray, "n m"]:
+    """Return what each state at the first row adds to the later efforts."""
+    rows, moved = np.empty((limited.size, row.size)), np.eye(row.size)
+    ways = way, way - np.outer(anti_windup, row)
     stretches = np.split(np.arange(limited.size), np.flatnonzero(np.diff(limited)) + 1) if limited.size else []
     for part in stretches:
-        way = ways[int(limited[part[0]])]
-        rows[part] = list_powers(law.c, way, part.size) @ moved
-        moved = np.linalg.matrix_power(way, part.size) @ moved
-    return law.per_effort * rows
+        taken = ways[int(limited[part[0]])]
+        rows[part] = list_powers(row, taken, part.size) @ moved
+        moved = np.linalg.matrix_power(taken, part.size) @ moved
+    return rows
 
 
 def list_powers(row: Float[np.ndarray, " m"], way: Float[np.ndarray, "m m"], count: int) -> Float[np.ndarray, "n m"]:
@@ -418,16 +438,8 @@ def find_offset(
     limited = find_at_limit(ticks, law)
     if not step or not count_integrals(law) or np.all(limited):
         return 0.0, np.zeros(len(ticks))
-    ones = replace(ticks, reference=np.ones(len(ticks)), measured=0.0 * ticks.measured)
-    steady = np.where(limited, 0.0, follow(replace(law, compensation=None), ones, limited, 0.0))
+    steady = np.where(limited, 0.0, find_steady(law, limited))
     return float(np.clip(steady @ error / (steady @ steady), -0.5 * step, 0.5 * step)), steady
-
-
-def list_impulses(law: RunnableLaw, count: int) -> Float[np.ndarray, "k n"]:
-    """Return what the reference, and each reading, makes of the commands from one row of it on."""
-    columns = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
-    direct = np.append(law.d_reference, -np.ravel(law.d_measurement))
-    return law.per_effort * np.vstack([direct, list_powers(law.c, law.a, count - 1) @ columns]).T
 
 
 def list_steps(ticks: Ticks) -> Float[np.ndarray, " k"]:

@@ -10,7 +10,7 @@ import pytest
 import seaopt as so
 from seaopt.control import Gains, runnable
 from seaopt.machine.bringup.excitation import design_excitation
-from seaopt.machine.stepped import find_modes
+from seaopt.machine.stepped import find_modes, find_steady
 from tests.machine.conftest import SPEC
 from tests.machine.simulator import Bench, Machine, multisine
 
@@ -48,6 +48,12 @@ def test_what_a_state_adds_to_the_commands_is_what_steps_add(controller):
         states = law.a @ states - at_limit * np.outer(law.anti_windup, effort)
     np.testing.assert_allclose(find_modes(law, limited), expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
     assert find_modes(law, limited[:0]).shape == (0, law.c.size)
+    x, expected = np.zeros(law.c.size), []
+    for at_limit in limited:  # of a reference of one
+        effort = law.c @ x + law.d_reference
+        expected.append(law.per_effort * effort)
+        x = law.a @ x + law.b_reference - at_limit * law.anti_windup * effort
+    np.testing.assert_allclose(find_steady(law, limited), expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize("decimals", [None, 2, 0])
