@@ -175,8 +175,8 @@ def measure_response(
     if not 0.0 < confidence < 1.0:
         raise LogError(f"confidence = {confidence:g} is not between 0 and 1; give 0.95, say")
     source = next(iter(plant.inputs)) if source is None else source
-    output, *others = (output,) if isinstance(output, str) else output
-    check_record(log, (source, output, *others))
+    output, *further = (output,) if isinstance(output, str) else output
+    check_record(log, (source, output, *further))
     if np.ptp(log[source]) == 0.0:
         raise LogError(f"{log.source}: {source} is constant; a frequency response needs excitation")
     moving = [rival for rival in plant.inputs if rival != source and rival in log.signals and np.ptp(log[rival]) > 0.0]
@@ -185,12 +185,14 @@ def measure_response(
             f"{log.source}: {', '.join(moving)} moves besides {source}, which counts as noise, and not as even noise; "
             f"take a log in which {source} alone is excited"
         )
-    if others:
-        each = 1.0 - (1.0 - confidence) / (1 + len(others))  # so that all together have the confidence asked
+    if further:
+        each = 1.0 - (1.0 - confidence) / (1 + len(further))  # so that all together have the confidence asked
         options: dict[str, Any] = {"source": source, "name": name, "clock": clock, "stretch_s": stretch_s}
-        first, *rest = (measure_response(plant, log, one, confidence=each, **options) for one in (output, *others))
-        rest = (replace(one, confidence=float(confidence)) for one in rest)
-        return replace(first, confidence=float(confidence), further=tuple(rest))
+        first, *responses = (
+            measure_response(plant, log, out, confidence=each, **options) for out in (output, *further)
+        )
+        responses = (replace(response, confidence=float(confidence)) for response in responses)
+        return replace(first, confidence=float(confidence), further=tuple(responses))
     chosen = Clock(period=log.period) if clock is None else clock
     lengths = [stretch_s] if stretch_s is not None else _list_windows(len(log), log.period)
     estimates = [h1(log[source], log[output], log.period, stretch_s=length) for length in lengths]

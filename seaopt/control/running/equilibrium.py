@@ -52,15 +52,15 @@ class Equilibrium:
         )
 
 
-def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters], place: float = math.nan) -> Equilibrium:
+def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters], variable: float = math.nan) -> Equilibrium:
     """Return where a loop, its current unlimited, rests at the conditions (such as phi) among each run's parameters; at
-    zero without any. `place`: where the variable of a schedule stands. Raises ControlError: the plant cannot rest
+    zero without any. `variable`: where that of a schedule stands. Raises ControlError: the plant cannot rest
     there, or no reference makes the law command what it takes.
     """
     plant, law, terms, stands = loop.plant, loop.law, None, np.zeros(0)
     before, around = np.cumsum(LawShape.of_law(law).sizes)[[3, 5]]  # what is kept before the place, and the command
     if not isinstance(law, RunnableLaw):
-        law, terms, stands = law.freeze(place, law.compensation), law.find_terms(place), np.array([place])
+        law, terms, stands = law.freeze(variable, law.compensation), law.find_terms(variable), np.array([variable])
     observe = observe_function(plant, sticks=False)
     names, rows = list(plant.outputs), [find_rest(plant, values) for values in params]
     figures = np.zeros((len(params), 5))
@@ -73,8 +73,9 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters], place:
         read = y[[names.index(name) for name in loop.fed_back]]
         force, weight, added = float(read[0]), 0.0, 0.0
         if law.compensation is not None:
-            known = {name: place for name in (loop.place,) if name is not None} | dict(zip(names, y, strict=False))
-            further = [float(known.get(name, 0.0)) for name in law.compensation.reads]
+            stated = {} if loop.place is None else {loop.place: variable}
+            readings = stated | dict(zip(names, y, strict=False))
+            further = [float(readings.get(name, 0.0)) for name in law.compensation.reads]
             weight, added, _ = law.compensation.step(FORGOTTEN, 0.0, further, terms)
         inner, reference = _law_at_rest(
             law, read if law.measured > 1 else force, float(u[0]) - law.per_effort * added, plant, loop.regulated

@@ -229,20 +229,20 @@ class RestStart:
     params: ParameterSet
     value: float  # of the variable
     states: dict[str, float]
-    rest: Equilibrium
+    equilibrium: Equilibrium
 
     @classmethod
     def at_rest(cls, schedule: ScheduledController, plant: Plant, params: ParameterSet, value: float) -> RestStart:
         """Return where a plant rests with the variable at a value."""
         placed, law = plant.complete(place_variable(plant, params, schedule.over, value)), schedule.runnable(outer=True)
         loop = build_loop(schedule.controllers[0], plant, [placed], law, place=schedule.over)
-        rest = equilibrium(loop, [placed], value)
+        start = equilibrium(loop, [placed], value)
         return cls(
             schedule=schedule,
             params=placed.drop_conditions(),
             value=value,
-            states=dict(zip(plant.states, rest.state.x[0].tolist(), strict=True)),
-            rest=rest,
+            states=dict(zip(plant.states, start.state.x[0].tolist(), strict=True)),
+            equilibrium=start,
         )
 
     @property
@@ -255,18 +255,18 @@ class RestStart:
         `places` are for a plant that does not have the variable. Raises SimulationError: to hold it there takes
         more than the command's limit, the loop runs away, or the gate gives its sensor up.
         """
-        law, held = self.schedule.runnable(outer=True), abs(float(self.rest.current_A[0]))
-        if held > law.command_limit:
-            needed, limit = (show_command(value, *law.command) for value in (held, law.command_limit))
+        law, holding = self.schedule.runnable(outer=True), abs(float(self.equilibrium.current_A[0]))
+        if holding > law.command_limit:
+            needed, limit = (show_command(value, *law.command) for value in (holding, law.command_limit))
             raise SimulationError(
                 f"{needed} holds it at {self.schedule.over} = {self.value:.4g}, above the limit of {limit}"
             )
         loop = build_loop(self.schedule.controllers[0], plant, [values], law, place=self.schedule.over)
-        played, count = self.rest.given[0] + references, len(references)
+        played, count = self.equilibrium.given[0] + references, len(references)
         if law.outer is not None:
             travelled, _ = law.outer.split(_travel(plant, law.outer, values, references.shape[1]))
-            played = self.rest.given[0] + references / law.outer.per_given + travelled
-        x, z = [self.states[name] for name in plant.states], self.rest.state.z
+            played = self.equilibrium.given[0] + references / law.outer.per_given + travelled
+        x, z = [self.states[name] for name in plant.states], self.equilibrium.state.z
         start = LoopState(x=np.tile(x, (count, 1)), z=np.tile(z, (count, 1)))
         run = run_loop(loop, [values] * count, played, start=start, places=places)
         if not all(np.all(np.isfinite(rows)) for rows in (*run.outputs.values(), run.current)):

@@ -79,7 +79,7 @@ def test_a_run_starts_at_the_rest_that_the_equations_have(fraction):
     assert run.outputs["tau"][0] == pytest.approx(np.full(300, torque), rel=1e-9)
     assert run.current[0] == pytest.approx(np.full(300, force / FORCE), rel=1e-9)
     assert start.states == pytest.approx({"q": L_A * np.sin(angle) + force / K, "v": 0.0, "phi": angle, "omega": 0.0})
-    assert start.rest.reference[0] == pytest.approx((1.0 - fraction) * torque, rel=1e-5)
+    assert start.equilibrium.reference[0] == pytest.approx((1.0 - fraction) * torque, rel=1e-5)
     assert np.max(np.abs(start.find_errors(run, np.full(300, angle)))) < 1e-9 * torque
 
 

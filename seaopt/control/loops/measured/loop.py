@@ -198,8 +198,8 @@ def map_disc(
     """Return centre and radius of the module's table, times D, and what the least and the largest are to be divided by,
     which is D, or `room` in its place, but for the last of the table; of arrays or expressions, whose `size` is abs.
     """
-    one, alone = 1.0 + open_loop, r * size(c_y)
-    back, reach = one.conjugate(), alone + constant_radius
+    return_difference, alone = 1.0 + open_loop, r * size(c_y)
+    back, reach = return_difference.conjugate(), alone + constant_radius
     match of:
         case "1":
             return back, reach, (room, room)
@@ -212,9 +212,9 @@ def map_disc(
         case "C_v":
             return c_v * back, reach * size(c_v), (room, room)
         case "P C_r":
-            whole = size(one)
+            whole = size(return_difference)
             least = room + constant_radius * (whole + 3.0 * alone + constant_radius)
-            centre, radius = c_r * (p * back - c_y.conjugate() * (r * r)), r * size(c_r * (one - p * c_y))
+            centre, radius = c_r * (p * back - c_y.conjugate() * (r * r)), r * size(c_r * (return_difference - p * c_y))
             return centre, radius, (least, room * (whole + alone) / (whole + reach))
         case _:
             raise AssertionError(of)
