@@ -31,6 +31,8 @@ from seaopt.machine.bringup.stages import BRINGUP_SCHEMA, FULL, OF_A_STAGE, slow
 from seaopt.machine.page.page import write_acceptance_page
 from seaopt.machine.response.periods import Played
 from seaopt.machine.stepped import Source
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
 from seaopt.problem import Problem, certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.problem.stages import design_mpc, list_plants
@@ -87,9 +89,7 @@ def accept_logs(
     if isinstance(source, ScheduledController):
         units[source.over] = source.unit
     units[STATUS] = "-"
-    link = None
-    if source.outer is not None and source.outer.plant in session.problem.plants:
-        link = session.problem.plants[source.outer.plant], session.values()
+    link = _find_link(session, source)
     plants = (session.problem.design_plant,) if link is None else (session.problem.design_plant, link[0])
     beside = {name: unit for plant in plants for name, unit in plant.outputs.items()}
     with show_progress(errors, "judging the logs", errors.say) as tell:
@@ -219,6 +219,13 @@ def _read_plan(session: Session, content: dict[str, Any]) -> ForceMPC | None:
     return plan
 
 
+def _find_link(session: Session, source: Source) -> tuple[Plant, ParameterSet] | None:
+    """Return the plant whose link a law's outer loop moves, with its values; None without one."""
+    if source.outer is None or source.outer.plant not in session.problem.plants:
+        return None
+    return session.problem.plants[source.outer.plant], session.values()
+
+
 def _list_units(controller: Controller) -> dict[str, str]:
     """Return the channels that a log of a controller has, with their units."""
     command = controller.command
@@ -334,6 +341,7 @@ def plan_bring_up(
             bias=bias,
             limits=_parse_limits(limits),
             sensors=session.problem.sensors,
+            link=_find_link(session, controller),
             certificate=session.certificate(),
             tune_stage=tune_stage,
             certify_stage=certify_stage,

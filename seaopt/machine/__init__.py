@@ -1,8 +1,9 @@
 """The law on the machine: the stages of its bring-up, and what logs recorded under it say."""
 
 from seaopt.machine.acceptance import Acceptance, accept
+from seaopt.machine.bringup.expected import Band
 from seaopt.machine.bringup.files import write_bring_up
-from seaopt.machine.bringup.stages import Band, BringUp, Stage, bring_up
+from seaopt.machine.bringup.stages import BringUp, Stage, bring_up
 from seaopt.machine.causes import Cause
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.explanations import Difference

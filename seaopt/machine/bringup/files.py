@@ -12,19 +12,21 @@ from seaopt.control.deploy.target import LOG_ROWS, Tare
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
-from seaopt.machine.bringup.stages import Band, BringUp, Stage
+from seaopt.machine.bringup.expected import Band, Expected
+from seaopt.machine.bringup.stages import BringUp, Stage
 
 PER_LINE = 8
-HEADER = """/* The reference of a stage of bring-up, made by seaopt: {phases} set(s) of phases, a period of
+OUTER = "outer_"  # begins the names of what is of the outer loop
+HEADER = """/* The reference of {what}, made by seaopt: {phases} set(s) of phases, a period of
  * {period} ticks, at {rate} Hz, in {bytes} bytes of constants.
- * Call stage_reference(tick) once per tick, from 0; it ends after STAGE_TICKS ticks, and is zero from there on. */
-#ifndef STAGE_REFERENCE_H
-#define STAGE_REFERENCE_H
-#define STAGE_TICKS {ticks}UL
-double stage_reference(unsigned long tick); /* {unit} */
+ * Call {call}_reference(tick) once per tick, from 0; it ends after {macro}_TICKS ticks, and is zero from there on. */
+#ifndef {macro}_REFERENCE_H
+#define {macro}_REFERENCE_H
+#define {macro}_TICKS {ticks}UL
+double {call}_reference(unsigned long tick); /* {unit} */
 #endif
 """
-SOURCE = """#include "reference.h"
+SOURCE = """#include "{stem}.h"
 
 #define PERIOD {period}UL
 #define PERIODS {periods}UL
@@ -40,12 +42,12 @@ static double fade(unsigned long tick)
     return share * share * (3.0 - (2.0 * share));
 }}
 
-double stage_reference(unsigned long tick)
+double {call}_reference(unsigned long tick)
 {{
     const unsigned long played = PHASES * PERIODS * PERIOD;
     if (tick < PERIOD) return fade(tick) * (double)wave[0][tick];
     if (tick < PERIOD + played) return (double)wave[(tick - PERIOD) / (PERIODS * PERIOD)][tick % PERIOD];
-    if (tick < STAGE_TICKS) return fade(STAGE_TICKS - 1UL - tick) * (double)wave[PHASES - 1UL][tick % PERIOD];
+    if (tick < {macro}_TICKS) return fade({macro}_TICKS - 1UL - tick) * (double)wave[PHASES - 1UL][tick % PERIOD];
     return 0.0;
 }}
 """
@@ -93,23 +95,32 @@ def write_stage(
     fit that its law was tuned with is met, which controller.json and the C state.
     """
     folder = Path(folder)
-    excitation, unit = stage.excitation, stage.controller.command.reference_unit
-    reference = excitation.reference
-    time = excitation.sample_time_s * np.arange(reference.size)
-    log = Log.from_arrays(time=time, reference=reference, units={"reference": unit}, source=stage.name)
-    period, phases = excitation.waves.shape[1], len(excitation.waves)
-    waves = ",\n".join(f"{{\n{_list_numbers(excitation.bias + wave)}\n}}" for wave in excitation.waves)
-    words = {"phases": phases, "period": period, "periods": excitation.periods, "ticks": reference.size, "unit": unit}
-    header = HEADER.format(**words, bytes=4 * period * phases, rate=f"{1.0 / excitation.sample_time_s:.10g}")
-    source = SOURCE.format(**words, waves=waves)
+    around = [] if stage.around is None else _write_played(stage.around, folder, "the outer loop", OUTER)
     return [
         *_export(stage, folder, tare, fit_met),
         write_json(folder / "controller.json", _describe(stage) | ({} if fit_met is None else {"fit_met": fit_met})),
-        write_log(log, folder / "reference.csv"),
-        write_text(folder / "reference.h", header),
-        write_text(folder / "reference.c", source),
-        write_text(folder / "expected_step.csv", _table("time [s]", stage.step)),
-        write_text(folder / "expected_tracking.csv", _table("frequency [Hz]", stage.tracking)),
+        *_write_played(stage, folder, "a stage of bring-up"),
+        *around,
+    ]
+
+
+def _write_played(expected: Expected, folder: Path, what: str, prefix: str = "") -> list[Path]:
+    """Write a reference as a table and as C, and the bands of its response, with names that begin alike."""
+    excitation, unit, stem = expected.excitation, expected.unit, f"{prefix}reference"
+    reference, call = excitation.reference, prefix.rstrip("_") or "stage"
+    time = excitation.sample_time_s * np.arange(reference.size)
+    log = Log.from_arrays(time=time, reference=reference, units={"reference": unit}, source=stem)
+    period, phases = excitation.waves.shape[1], len(excitation.waves)
+    waves = ",\n".join(f"{{\n{_list_numbers(excitation.bias + wave)}\n}}" for wave in excitation.waves)
+    words = {"phases": phases, "period": period, "periods": excitation.periods, "ticks": reference.size, "unit": unit}
+    words |= {"what": what, "call": call, "macro": call.upper(), "stem": stem}
+    header = HEADER.format(**words, bytes=4 * period * phases, rate=f"{1.0 / excitation.sample_time_s:.10g}")
+    return [
+        write_log(log, folder / f"{stem}.csv"),
+        write_text(folder / f"{stem}.h", header),
+        write_text(folder / f"{stem}.c", SOURCE.format(**words, waves=waves)),
+        write_text(folder / f"expected_{prefix}step.csv", _table("time [s]", expected.step)),
+        write_text(folder / f"expected_{prefix}tracking.csv", _table("frequency [Hz]", expected.tracking)),
     ]
 
 

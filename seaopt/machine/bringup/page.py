@@ -11,7 +11,8 @@ import numpy as np
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.formatting import format_count, format_number, join_words
-from seaopt.machine.bringup.stages import Band, BringUp, Stage
+from seaopt.machine.bringup.expected import Band, Expected, OuterExpected
+from seaopt.machine.bringup.stages import BringUp, Stage
 from seaopt.machine.response.verdicts import find_friction, has_dry_friction
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
 from seaopt.reporting.page.chart import make_chart
@@ -70,7 +71,11 @@ OUTER = (
 )
 PLACE = (
     "its x_0 as the reference, with the link's position: seaopt accept replays both, and judges the loop with the "
-    "outer loop in it. Let x_0 move by the last stage's reference over the stiffness, {}."
+    "outer loop in it. {}"
+)
+OVER = "Let x_0 move by the last stage's reference over the stiffness, {}."
+PLAY_OUTER = (
+    "Close the outer loop, with the link as in {}, and play {}/outer_reference.csv (or outer_reference.c) as {}: "
 )
 FORCE = "what step was given as the reference; or, with the link's position, the force that the damping is added to."
 
@@ -87,10 +92,12 @@ def summarise(result: BringUp) -> list[KeyFigure]:
     ]
 
 
-def _say_logged(controller: Controller, outer: OuterLoop) -> str:
-    """Return what to log, and to play, with an outer loop closed."""
-    unit = mechanics_of(outer.place_unit).stiffness
-    return PLACE.format(f"{outer.stiffness:.4g} {unit}") if controller.renders else FORCE
+def _say_logged(stage: Stage, outer: OuterLoop) -> str:
+    """Return what to log with an outer loop closed, and what to play where there is no reference for it."""
+    if not outer.stiffness:
+        return FORCE
+    stiffness = f"{outer.stiffness:.4g} {mechanics_of(outer.place_unit).stiffness}"
+    return PLACE.format("Its reference is below." if stage.around else OVER.format(stiffness))
 
 
 def describe(result: BringUp) -> list[Section]:
@@ -98,7 +105,7 @@ def describe(result: BringUp) -> list[Section]:
     rows = tuple(_list_row(stage) for stage in result.stages)
     head = ("stage", "law", "bandwidth (Hz)", "stuck (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
     last = result.stages[-1].controller
-    outer = () if last.outer is None else (OUTER.format(_say_logged(last, last.outer)),)
+    outer = () if last.outer is None else (OUTER.format(_say_logged(result.stages[-1], last.outer)),)
     still = [stage.name for stage in result.stages if stage.still]
     held = (HELD.format(join_words(still)),) if still else ()
     overview = Section(
@@ -107,7 +114,8 @@ def describe(result: BringUp) -> list[Section]:
         tables=(Table(head=head, rows=rows, align="<<>>>>>>"),),
         remarks=(*held, *_explain_bandwidths(last), *(f"Stop a stage when {text}" for text in ALWAYS), NEXT, *outer),
     )
-    return [overview, *(_describe_stage(stage) for stage in result.stages)]
+    around = (_describe_outer(stage, stage.around) for stage in result.stages if stage.around is not None)
+    return [overview, *(_describe_stage(stage) for stage in result.stages), *around]
 
 
 def _explain_bandwidths(controller: Controller) -> tuple[str, ...]:
@@ -125,7 +133,7 @@ def _explain_friction(controller: Controller) -> tuple[str, ...]:
     return (SLIDES.format(f"{format_number(friction, 3)}{unit_after(controller.command.effort_unit)}"),)
 
 
-def _say_whether_it_moves(stage: Stage) -> tuple[str, ...]:
+def _say_whether_it_moves(stage: Expected) -> tuple[str, ...]:
     """Return whether what is played moves the motor, where it has dry friction."""
     if stage.effort is None or stage.friction is None:
         return ()
@@ -151,13 +159,7 @@ def _list_row(stage: Stage) -> tuple[Any, ...]:
 
 
 def _describe_stage(stage: Stage) -> Section:
-    controller, excitation = stage.controller, stage.excitation
-    period = excitation.waves.shape[1] * excitation.sample_time_s
-    f = excitation.frequency_hz
-    step = stage.step
-    top = format_number(max(step.low), 3), format_number(max(step.high), 3)
-    outputs = {} if controller.design is None else controller.see(controller.design[0]).outputs
-    units = {controller.command.input: controller.command.unit, **outputs}
+    controller = stage.controller
     source, code = stage.source, "force_mpc.c" if isinstance(stage.source, ForceMPC) else "force_law.c"
     held = f"Keep {source.over} at {format_number(stage.place)}." if isinstance(source, ScheduledController) else ""
     begin = "begin with force_mpc_reset" if isinstance(source, ForceMPC) else BEGIN.format(stage.name)
@@ -165,16 +167,60 @@ def _describe_stage(stage: Stage) -> Section:
     sentences = [
         *([held] if held else []),
         *([f"{stage.note[0].upper()}{stage.note[1:]}."] if stage.note else []),
-        f"Flash {stage.name}/{code}, {begin}, play {stage.name}/reference.csv (or reference.c): it fades in over "
-        f"{format_number(period, 3)} s, then {format_count(len(excitation.waves), 'set')} of phases of "
-        f"{excitation.periods} periods of {format_number(period, 3)} s, {f.size} lines from {format_number(f[0], 3)} "
-        f"to {format_number(f[-1], 3)} Hz, then it fades out.",
+        f"Flash {stage.name}/{code}, {begin}, play {stage.name}/reference.csv (or reference.c): {_say_played(stage)}",
         f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)}{ring}.",
-        f"Expect: a step of the reference{_say_size(stage)} peaks at {' to '.join(dict.fromkeys(top))} of its size "
+        f"Expect: a step of the reference{_say_size(stage)} peaks at {_say_top(stage)} of its size "
         f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
         *_say_whether_it_moves(stage),
         *_explain_friction(controller),
     ]
+    return Section(
+        title=f"Stage {stage.name}", part="stages", sentences=tuple(sentences), tables=(_tabulate_peaks(stage),)
+    )
+
+
+def _describe_outer(stage: Stage, around: OuterExpected) -> Section:
+    """Return what to play, to log and to expect with the outer loop closed."""
+    controller, outer = around.controller, around.outer
+    given = f"x_0, in {around.unit}" if outer.stiffness else f"the force that the damping is added to, in {around.unit}"
+    *before, command = stage.channels
+    sentences = (
+        PLAY_OUTER.format(outer.plant or "the plant of the link", stage.name, given) + _say_played(around),
+        f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: "
+        f"{join_words(list(dict.fromkeys((*before, outer.position, command))))}; the reference is what was played, in "
+        f"{around.unit}.",
+        f"Expect: {around.follows} after a step of the reference{_say_size(around)} peaks at {_say_top(around)} of its "
+        f"size ({stage.name}/expected_outer_step.csv); the response over frequency is in "
+        f"{stage.name}/expected_outer_tracking.csv.",
+        *_say_whether_it_moves(around),
+        *_explain_friction(controller),
+    )
+    title = f"Stage {stage.name}, with the outer loop"
+    return Section(title=title, part="stages", sentences=sentences, tables=(_tabulate_peaks(around),))
+
+
+def _say_played(expected: Expected) -> str:
+    """Return how a reference goes on."""
+    excitation = expected.excitation
+    period, f = excitation.waves.shape[1] * excitation.sample_time_s, excitation.frequency_hz
+    sets, lasts = format_count(len(excitation.waves), "set"), f"{format_number(period, 3)} s"
+    return (
+        f"it fades in over {lasts}, then {sets} of phases of {excitation.periods} periods of {lasts}, {f.size} lines "
+        f"from {format_number(f[0], 3)} to {format_number(f[-1], 3)} Hz, then it fades out."
+    )
+
+
+def _say_top(expected: Expected) -> str:
+    """Return the peak of a step, from the least to the largest of the draws."""
+    step = expected.step
+    return " to ".join(dict.fromkeys(format_number(max(edge), 3) for edge in (step.low, step.high)))
+
+
+def _tabulate_peaks(stage: Expected) -> Table:
+    """Return how large signals may become."""
+    controller, excitation = stage.controller, stage.excitation
+    outputs = {} if controller.design is None else controller.see(controller.design[0]).outputs
+    units = {controller.command.input: controller.command.unit, **outputs}
     rows = tuple(
         (
             name,
@@ -184,18 +230,17 @@ def _describe_stage(stage: Stage) -> Section:
         )
         for name, peak, limit in ((name, peak, excitation.limits.get(name)) for name, peak in excitation.peaks.items())
     )
-    table = Table(head=("signal", "expected at most", "stop beyond", "limit"), rows=rows, align="<>>>")
-    return Section(title=f"Stage {stage.name}", part="stages", sentences=tuple(sentences), tables=(table,))
+    return Table(head=("signal", "expected at most", "stop beyond", "limit"), rows=rows, align="<>>>")
 
 
-def _say_size(stage: Stage) -> str:
+def _say_size(stage: Expected) -> str:
     """Return up to which size a step is one of the linear loop."""
-    unit = unit_after(stage.controller.command.reference_unit)
+    unit = unit_after(stage.unit)
     return "" if stage.step_size is None else f" of up to {format_number(stage.step_size, 3)}{unit}"
 
 
-def _list_panels(stage: Stage) -> Iterator[Panel]:
-    unit, friction = stage.controller.spec.regulated, _explain_friction(stage.controller)
+def _list_panels(name: str, stage: Expected) -> Iterator[Panel]:
+    friction = _explain_friction(stage.controller)
     step, tracking = _say_width(stage.step), _say_width(stage.tracking)
     if friction:
         captions = [f"The band is that of the certificate's draws, {each}. {friction[0]}" for each in (step, tracking)]
@@ -212,12 +257,12 @@ def _list_panels(stage: Stage) -> Iterator[Panel]:
         _draw_band(axis, stage.tracking, to_decibel)
 
     yield Panel(
-        name=f"step_{stage.name}", title=f"{stage.name}: step", draw=draw_step, x="time [s]",
-        y=(f"{unit} over the step [-]",), tight=True,
+        name=f"step_{name}", title=f"{name}: step", draw=draw_step, x="time [s]",
+        y=(f"{stage.follows} over the step [-]",), tight=True,
         caption=captions[0],
     )  # fmt: skip
     yield frequency_panel(
-        name=f"tracking_{stage.name}", title=f"{stage.name}: tracking", draw=draw_tracking, y=("|Y/R| [dB]",),
+        name=f"tracking_{name}", title=f"{name}: tracking", draw=draw_tracking, y=("|Y/R| [dB]",),
         tight=True, caption=captions[1],
     )  # fmt: skip
 
@@ -266,9 +311,11 @@ def write_bring_up_page(
     FileError
         The folder cannot be written.
     """
+    shown: dict[str, Expected] = {stage.name: stage for stage in result.stages}
+    shown |= {f"{stage.name}_outer": stage.around for stage in result.stages if stage.around is not None}
     plates = [
-        {"heading": stage.name, "text": "", "charts": [make_chart(panel) for panel in _list_panels(stage)]}
-        for stage in result.stages
+        {"heading": name, "text": "", "charts": [make_chart(panel) for panel in _list_panels(name, each)]}
+        for name, each in shown.items()
     ]
     return write_result_page(
         path,

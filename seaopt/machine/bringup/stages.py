@@ -6,58 +6,45 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
-import numpy as np
-from jaxtyping import Float
-
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
 from seaopt.control import Controller, ControllerSpec, ForceMPC, MPCSpec, ScheduledController, force_mpc
-from seaopt.control.running.closed_loop import LoopRun
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
-from seaopt.machine.bringup.excitation import Excitation, design_excitation
-from seaopt.machine.design_run import run_design
-from seaopt.machine.response.verdicts import LEAST_PHASES, AgainstFriction, find_friction, has_dry_friction
+from seaopt.machine.bringup.expected import (
+    BARELY,
+    MOVES,
+    SEED,
+    Expected,
+    OuterExpected,
+    enclose_link,
+    expect,
+    expect_outer,
+    split_limits,
+)
+from seaopt.machine.response.verdicts import find_friction
 from seaopt.machine.stepped import Source, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
 from seaopt.records import Result, Worded, record
 from seaopt.robustness import Certificate, certify, tune_certified
-from seaopt.robustness.uncertainty.worst import place_values
-from seaopt.robustness.verification.verification import list_readings
 from seaopt.signals import REFERENCE
 
 BRINGUP_SCHEMA = "seaopt/bringup/1"
 FRACTIONS, FULL = (0.25, 0.5), "full"  # what the stages before the last ask for, and the name of the last
 UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
-DRAWS, SEED = 60, 1
+DRAWS = 60
 STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
-STOP = 1.3  # times what is predicted: where to stop
-MOVES = 2.0  # times the dry friction: the effort that a stage's reference is to make where the limits leave room
-BARELY = 1.2  # times the dry friction: the effort where the limits leave no room for that
-RAISES, ONWARD = 4, 1.1  # times that an amplitude is raised to it, and by which factor at least
-NOISE_RUNS = 4  # with other noise each, whose largest peaks count
 OF_A_STAGE = (  # options of predictive control that a stage may have otherwise
     "bandwidth_hz", "min_sensitivity_bandwidth_hz", "current_limit_A", "command_limit", "largest_force_N",
 )  # fmt: skip
-PERIODS, PERIODS_OF_PHASES = 10, 4  # of one set of phases, and of each of six
 Spec = TypeVar("Spec", ControllerSpec, MPCSpec)
 
 
-@record
-class Band:
-    """A response over time or frequency, and between what it lies on the draws."""
-
-    at: tuple[float, ...]  # s or Hz
-    nominal: tuple[float, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-
-
 @record(eq=False)
-class Stage(AgainstFriction):
+class Stage(Expected):
     """One law on its way to the machine.
 
     Parameters
@@ -65,45 +52,23 @@ class Stage(AgainstFriction):
     name : str
         Of its folder.
     source : Controller, ScheduledController or ForceMPC
-        What is exported.
-    controller : Controller
-        It, as a law: of a schedule where its variable stands, of predictive control while no limit is active.
+        What is exported; `controller` is it as a law: of a schedule where its variable stands, of predictive control
+        while no limit is active.
     certificate : Certificate
-    excitation : Excitation
-        The reference to play.
-    tracking, sensitivity : Band
-        Sizes of Y/R and S at the lines.
-    step : Band
-        The regulated output after a step of one.
-    step_size : float or None
-        The largest step whose command stays within its limit; None without one.
-    stop : mapping of str to float
-        Largest magnitudes; beyond them the stage is to be stopped.
     note : str
         In what the stage differs from what was planned.
     place : float or None
         Where a schedule's variable is to stand.
-    effort : float or None
-        Of a plant with dry friction: the most by which the effort swings about its middle while the periods are
-        played, by simulation.
-    friction : float or None
-        The effort that dry friction takes: below it the motor does not move.
+    around : OuterExpected or None
+        Of the full law: what to play when its outer loop is closed, too, where the plant of its link is known.
     """
 
     name: str
     source: Source
-    controller: Controller
     certificate: Certificate
-    excitation: Excitation
-    tracking: Band
-    sensitivity: Band
-    step: Band
-    step_size: float | None
-    stop: Mapping[str, float]
     note: str = ""
     place: float | None = None
-    effort: float | None = None
-    friction: float | None = None
+    around: OuterExpected | None = None
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -134,7 +99,7 @@ class BringUp(Result, Worded):
 
 
 def _describe(stage: Stage) -> dict[str, Any]:
-    excitation, controller = stage.excitation, stage.controller
+    controller, around = stage.controller, stage.around
     return {
         "name": stage.name,
         "note": stage.note,
@@ -144,21 +109,29 @@ def _describe(stage: Stage) -> dict[str, Any]:
         "command_limit": controller.command_limit,
         "channels": stage.channels,
         "rate_hz": 1.0 / controller.sample_time_s,
+        **_describe_played(stage),
+        "outer": None if around is None else _describe_played(around),
+    }
+
+
+def _describe_played(expected: Expected) -> dict[str, Any]:
+    excitation = expected.excitation
+    return {
         "reference": {
             "amplitude": excitation.amplitude,
             "bias": excitation.bias,
-            "unit": controller.command.reference_unit,
+            "unit": expected.unit,
             "period_s": excitation.waves.shape[1] * excitation.sample_time_s,
             "periods": excitation.periods,
             "phases": len(excitation.waves),
             "frequency_hz": excitation.frequency_hz,
         },
-        "friction": stage.motion,
+        "friction": expected.motion,
         "peaks": excitation.peaks,
         "limits": excitation.limits,
-        "stop": stage.stop,
-        "step_size": stage.step_size,
-        "expected": {"tracking": stage.tracking, "sensitivity": stage.sensitivity, "step": stage.step},
+        "stop": expected.stop,
+        "step_size": expected.step_size,
+        "expected": {"tracking": expected.tracking, "sensitivity": expected.sensitivity, "step": expected.step},
     }
 
 
@@ -174,6 +147,7 @@ def bring_up(
     bias: float = 0.0,
     limits: Mapping[str, float] | None = None,
     sensors: Sensors | None = None,
+    link: tuple[Plant, ParameterSet] | None = None,
     certificate: Certificate | None = None,
     tune_stage: Callable[[float], Source] | None = None,
     certify_stage: Callable[[Any], Certificate] | None = None,
@@ -203,9 +177,12 @@ def bring_up(
     bias : float
         The reference's mean, in its unit.
     limits : mapping of str to float, optional
-        Largest magnitudes of outputs of the design plant: force and travel.
+        Largest magnitudes of outputs of the design plant, and of that of `link`: force and travel.
     sensors : Sensors, optional
         Noise and rounding of what the law reads, which the peaks that are expected then contain.
+    link : (Plant, ParameterSet), optional
+        The plant whose link the law's outer loop moves, with its values, as in `accept`: the full law then has a
+        reference for that loop, too.
     certificate : Certificate, optional
         Of the full law, where there is one.
     tune_stage, certify_stage : callable, optional
@@ -265,12 +242,16 @@ def bring_up(
         return tune_certified(controller.design[0], uncertainty, spec, plants, **options).controller
 
     certifying, tuning = certify_stage or certify_one, tune_stage or tune_one
-    options: dict[str, Any] = {"share": share, "bias": bias, "limits": dict(limits or {}), "seed": seed}
-    options["sensors"] = sensors
+    of_law, of_link = split_limits(stand(controller, None), limits or {}, link)
+    options: dict[str, Any] = {"share": share, "bias": bias, "limits": of_law, "seed": seed, "sensors": sensors}
     over = controller.over if isinstance(controller, ScheduledController) else None
     inside = {name: ends for name, ends in (ranges or {}).items() if name != over}
-    drawn = list_draws(stand(controller, None), uncertainty, inside, DRAWS, seed)
-    draws = [{name: value for name, value in each.items() if name != over} for each in drawn]
+
+    def draw(law: Controller) -> list[dict[str, float]]:
+        drawn = list_draws(law, uncertainty, inside, DRAWS, seed)
+        return [{name: value for name, value in each.items() if name != over} for each in drawn]
+
+    draws = draw(stand(controller, None))
     places = controller.points if isinstance(controller, ScheduledController) else (None,)
     stages, count = list[Stage](), len(fractions) + len(places)
 
@@ -291,7 +272,13 @@ def bring_up(
         certificate = certifying(controller)
     for number, place in enumerate(places, start=1):
         name = FULL if len(places) == 1 else f"{FULL}_{number}"
-        keep(_make_stage(name, controller, certificate, "", draws, options | {"most": share, "place": place}))
+        stage = _make_stage(name, controller, certificate, "", draws, options | {"most": share, "place": place})
+        outer = stage.controller.outer
+        enclosed = enclose_link(stage.controller, link, None if over is None or place is None else (over, place))
+        if outer is not None and enclosed is not None:
+            part = options | {"most": share, "bias": 0.0, "limits": of_link}
+            stage = replace(stage, around=expect_outer(stage.controller, outer, enclosed, draw(enclosed), part))
+        keep(stage)
     return BringUp(stages=tuple(stages))
 
 
@@ -388,109 +375,6 @@ def _make_stage(
     options: Mapping[str, Any],
 ) -> Stage:
     place, controller = options["place"], stand(source, options["place"])
-    excitation, effort, friction = _excite(controller, options)
-    assert controller.design is not None
-    plant, values = controller.design
-    sets = [values, *(place_values(plant, values, each) for each in draws)]
-    loops = [controller.close(plant, each) for each in sets]
-    f = excitation.frequency_hz
     count = round(STEP_PERIODS / controller.spec.bandwidth_hz / controller.sample_time_s)
-    runs = [loop.simulate(np.ones(count)) for loop in loops]
-    steps, efforts = (np.array([run[k] for run in runs]) for k in (0, 1))
-    limit = controller.command_limit
-    time = controller.sample_time_s * np.arange(count)
-    return Stage(
-        name=name,
-        source=source,
-        controller=controller,
-        certificate=certificate,
-        excitation=excitation,
-        tracking=_band(f, np.abs([loop.tracking(f) for loop in loops])),
-        sensitivity=_band(f, np.abs([loop.sensitivity(f) for loop in loops])),
-        step=_band(time, steps),
-        step_size=None if limit is None else float(limit / controller.per_effort / np.max(np.abs(efforts))),
-        stop={key: min(STOP * peak, excitation.limits.get(key, np.inf)) for key, peak in excitation.peaks.items()},
-        note=note,
-        place=place,
-        effort=effort,
-        friction=friction,
-    )
-
-
-def _excite(controller: Controller, options: Mapping[str, Any]) -> tuple[Excitation, float | None, float | None]:
-    """Return the reference of a stage; of a plant with dry friction the effort that it makes and the friction, with an
-    amplitude that moves the motor where the largest share of the limits, "most", allows it.
-    """
-    dry = has_dry_friction(controller)
-    given: dict[str, Any] = {key: options[key] for key in ("bias", "limits", "seed")}
-    given["phases"], given["periods"] = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
-    share, most, friction = options["share"], options["most"], find_friction(controller)
-
-    def play(share: float) -> tuple[Excitation, LoopRun | None, float | None]:
-        excitation = design_excitation(controller, share=share, **given)
-        run = _run_terms(controller, excitation)
-        return excitation, run, None if run is None or not dry else _measure_swing(controller, excitation, run)
-
-    excitation, run, effort = play(share)
-    for _ in range(RAISES):
-        if effort is None or effort >= MOVES * friction or share >= most:
-            break
-        share = min(share * max(MOVES * friction / max(effort, 1e-12), ONWARD), most)
-        excitation, run, effort = play(share)
-    peaks = _add_noise(controller, excitation, options["sensors"])
-    if run is not None:
-        signals = {**run.outputs, controller.command.input: run.current}
-        peaks = {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
-    return replace(excitation, peaks=peaks), effort, friction if dry else None
-
-
-def _run_terms(controller: Controller, excitation: Excitation) -> LoopRun | None:
-    """Return the run of a reference where the law has terms, or where one set of phases follows another: its peaks may
-    be larger than those of the lines.
-    """
-    if controller.design is None or (controller.compensation is None and len(excitation.waves) == 1):
-        return None
-    alone = replace(controller, outer=None)  # a stage is of the force law alone
-    return run_design(alone, [controller.design[1]], excitation.reference)
-
-
-def _measure_swing(controller: Controller, excitation: Excitation, run: LoopRun) -> float:
-    """Return the most by which the effort swings about its middle while the periods are played."""
-    period = excitation.waves.shape[1]
-    return float(np.ptp(run.current[0, period:-period])) / 2.0 / abs(controller.per_effort)
-
-
-def _add_noise(controller: Controller, excitation: Excitation, sensors: Sensors | None) -> dict[str, float]:
-    """Return the peaks of a reference where the readings have their noise and rounding: of the command, the plant and
-    what is read, those of `NOISE_RUNS` runs where they are larger. A reading's noise is drawn anew for its own peak,
-    which does not change how likely it is: white noise reaches the plant a sample later at the earliest.
-    """
-    peaks = dict(excitation.peaks)
-    if sensors is None or controller.design is None:
-        return peaks
-    plant, values = controller.design
-    noise = Sensors(noise_std=sensors.noise_std, quantisation=sensors.quantisation)
-    noise = noise.of(list_readings(controller, {"": plant}))
-    if not any((*noise.noise_std.values(), *noise.quantisation.values())):
-        return peaks
-    seen, alone = controller.see(plant), replace(controller, outer=None)  # a stage is of the force law alone
-    completed = seen.complete(controller.delay(values))
-    errors = {name: noise.combine_errors(seen, completed, name) for name in controller.signals if name in peaks}
-    for seed in range(NOISE_RUNS):
-        run = run_design(alone, [values], excitation.reference, sensors=noise, seed=seed)
-        signals = {**run.outputs, controller.command.input: run.current}
-        rng = np.random.default_rng((SEED, seed))
-        for name, (std, step) in errors.items():
-            signals[name] = np.abs(signals[name] + std * rng.normal(size=signals[name].shape)) + 0.5 * step
-        peaks = {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
-    return peaks
-
-
-def _band(at: Float[np.ndarray, " m"], rows: Any) -> Band:
-    rows = np.asarray(rows)
-    return Band(
-        at=tuple(at.tolist()),
-        nominal=tuple(rows[0].tolist()),
-        low=tuple(np.min(rows, axis=0).tolist()),
-        high=tuple(np.max(rows, axis=0).tolist()),
-    )
+    expected = expect(controller, draws, options, count)
+    return Stage(name=name, source=source, certificate=certificate, note=note, place=place, **expected)

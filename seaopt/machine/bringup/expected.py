@@ -1,0 +1,282 @@
+"""What a law is to do under the reference of a stage, alone or with its outer loop: what is played and expected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from seaopt.bench import Sensors
+from seaopt.control import Controller
+from seaopt.control.loops.moved_link import MOVED, find_position
+from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.control.running.closed_loop import LoopRun
+from seaopt.control.scheduling.scheduled_controller import place_variable
+from seaopt.machine.bringup.excitation import Excitation, design_excitation
+from seaopt.machine.design_run import run_design
+from seaopt.machine.response.enclosed import enclose_outer
+from seaopt.machine.response.verdicts import LEAST_PHASES, AgainstFriction, find_friction, has_dry_friction
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.records import record
+from seaopt.robustness.uncertainty.worst import place_values
+from seaopt.robustness.verification.verification import list_readings
+
+STOP = 1.3  # times what is predicted: where to stop
+MOVES = 2.0  # times the dry friction: the effort that a stage's reference is to make where the limits leave room
+BARELY = 1.2  # times the dry friction: the effort where the limits leave no room for that
+RAISES, ONWARD = 4, 1.1  # times that an amplitude is raised to it, and by which factor at least
+SEED = 1
+NOISE_RUNS = 4  # with other noise each, whose largest peaks count
+PERIODS, PERIODS_OF_PHASES = 10, 4  # of one set of phases, and of each of six
+
+
+@record
+class Band:
+    """A response over time or frequency, and between what it lies on the draws."""
+
+    at: tuple[float, ...]  # s or Hz
+    nominal: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
+@record(eq=False)
+class Expected(AgainstFriction):
+    """What is played, and what it is to do.
+
+    Parameters
+    ----------
+    controller : Controller
+        What closes the loop, as one law.
+    excitation : Excitation
+        The reference to play.
+    tracking, sensitivity : Band
+        Sizes of Y/R and S at the lines.
+    step : Band
+        What follows the reference, after a step of one.
+    step_size : float or None
+        The largest step whose command stays within its limit; None without one.
+    stop : mapping of str to float
+        Largest magnitudes; beyond them the stage is to be stopped.
+    effort : float or None
+        Of a plant with dry friction: the most by which the effort swings about its middle while the periods are
+        played, by simulation.
+    friction : float or None
+        The effort that dry friction takes: below it the motor does not move.
+    """
+
+    controller: Controller
+    excitation: Excitation
+    tracking: Band
+    sensitivity: Band
+    step: Band
+    step_size: float | None
+    stop: Mapping[str, float]
+    effort: float | None = None
+    friction: float | None = None
+
+    @property
+    def unit(self) -> str:
+        """Of the reference."""
+        return self.controller.command.reference_unit
+
+    @property
+    def follows(self) -> str:
+        """The output that follows the reference."""
+        return self.controller.spec.regulated
+
+
+@record(eq=False)
+class OuterExpected(Expected):
+    """What is played once the outer loop is closed around the full law, on the plant of its link; `controller` is the
+    law with the outer loop in it. The reference is x_0, without a stiffness the force that the damping is added to.
+    """
+
+    outer: OuterLoop
+
+    @property
+    def unit(self) -> str:
+        """Of the reference."""
+        return self.outer.place_unit if self.outer.stiffness else self.controller.command.reference_unit
+
+    @property
+    def follows(self) -> str:
+        """The output that follows the reference."""
+        return self.outer.position if self.outer.stiffness else self.controller.spec.regulated
+
+
+def expect(
+    controller: Controller,
+    draws: Sequence[Mapping[str, float]],
+    options: Mapping[str, Any],
+    count: int | None = None,
+    *,
+    shown: Controller | None = None,
+    runs: Controller | None = None,
+    per_given: float = 1.0,
+) -> dict[str, Any]:
+    """Return the fields of what is expected. `count`: samples of a step, as many as a period has if left out. Of a law
+    with an outer loop in it `shown` is the same law, what follows the reference being the first that it reads, `runs`
+    is what runs, and `per_given` the controller's reference by one of what that is given.
+    """
+    shown = controller if shown is None else shown
+    runs = replace(controller, outer=None) if runs is None else runs  # a stage is of the force law alone
+    excitation, effort, friction = _excite(controller, runs, per_given, options)
+    assert controller.design is not None
+    plant, values = controller.design
+    loops = [shown.close(plant, each) for each in (values, *(place_values(plant, values, each) for each in draws))]
+    f, size = excitation.frequency_hz, abs(per_given)
+    stepped = [loop.simulate(np.full(count or excitation.waves.shape[1], per_given)) for loop in loops]
+    steps, efforts = (np.array([run[k] for run in stepped]) for k in (0, 1))
+    limit = controller.command_limit
+    return {
+        "controller": controller,
+        "excitation": _scale(excitation, per_given),
+        "tracking": _band(f, size * np.abs([loop.tracking(f) for loop in loops])),
+        "sensitivity": _band(f, np.abs([loop.sensitivity(f) for loop in loops])),
+        "step": _band(controller.sample_time_s * np.arange(steps.shape[1]), steps),
+        "step_size": None if limit is None else float(limit / controller.per_effort / np.max(np.abs(efforts))),
+        "stop": {key: min(STOP * peak, excitation.limits.get(key, np.inf)) for key, peak in excitation.peaks.items()},
+        "effort": effort,
+        "friction": friction,
+    }
+
+
+def split_limits(
+    controller: Controller, limits: Mapping[str, float], link: tuple[Plant, ParameterSet] | None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the limits of the law alone, and of it with its outer loop on the plant of its link; what neither plant
+    has is left to be refused.
+    """
+    if controller.outer is None or link is None or controller.design is None:
+        return dict(limits), {}
+    own, other = (controller.see(plant).outputs for plant in (controller.design[0], link[0]))
+    alone = {name: value for name, value in limits.items() if name in own or name not in other}
+    return alone, {name: value for name, value in limits.items() if name in other}
+
+
+def enclose_link(
+    controller: Controller, link: tuple[Plant, ParameterSet] | None, place: tuple[str, float] | None
+) -> Controller | None:
+    """Return a law with its outer loop in it, where that is stable on the plant of its link. `place`: of a schedule's
+    variable.
+    """
+    if controller.outer is None or link is None:
+        return None
+    enclosed = enclose_outer(controller, link if place is None else (link[0], place_variable(*link, *place)))
+    return enclosed if enclosed.achieved.stable else None
+
+
+def expect_outer(
+    law: Controller,
+    outer: OuterLoop,
+    enclosed: Controller,
+    draws: Sequence[Mapping[str, float]],
+    options: Mapping[str, Any],
+) -> OuterExpected:
+    """Return what is played and expected with a law's outer loop closed, which is in the law that is enclosed: with a
+    stiffness the link follows x_0.
+    """
+    assert enclosed.design is not None
+    shown, runs = enclosed, replace(law, design=enclosed.design)
+    if outer.stiffness:
+        place = find_position(enclosed.design[0], outer)
+        order = sorted(range(len(enclosed.signals)), key=lambda k: enclosed.signals[k] != place)
+        columns = [0, *(1 + k for k in order)]
+        ordered = replace(enclosed.law, b=enclosed.law.b[:, columns], d=enclosed.law.d[columns])
+        shown = replace(enclosed, law=ordered, reads=tuple(enclosed.signals[k] for k in order))
+    fields = expect(enclosed, draws, options, shown=shown, runs=runs, per_given=outer.per_given)
+    fields["stop"].pop(MOVED, None)  # which is the position, as the damping has it
+    peaks = {name: peak for name, peak in fields["excitation"].peaks.items() if name != MOVED}
+    return OuterExpected(outer=outer, **fields | {"excitation": replace(fields["excitation"], peaks=peaks)})
+
+
+def _excite(
+    controller: Controller, runs: Controller, per_given: float, options: Mapping[str, Any]
+) -> tuple[Excitation, float | None, float | None]:
+    """Return the reference of a stage; of a plant with dry friction the effort that it makes and the friction, with an
+    amplitude that moves the motor where the largest share of the limits, "most", allows it.
+    """
+    dry = has_dry_friction(controller)
+    given: dict[str, Any] = {key: options[key] for key in ("bias", "limits", "seed")}
+    given["phases"], given["periods"] = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
+    share, most, friction = options["share"], options["most"], find_friction(controller)
+
+    def play(share: float) -> tuple[Excitation, LoopRun | None, float | None]:
+        excitation = design_excitation(controller, share=share, **given)
+        run = _run_terms(controller, runs, _scale(excitation, per_given))
+        return excitation, run, None if run is None or not dry else _measure_swing(controller, excitation, run)
+
+    excitation, run, effort = play(share)
+    for _ in range(RAISES):
+        if effort is None or effort >= MOVES * friction or share >= most:
+            break
+        share = min(share * max(MOVES * friction / max(effort, 1e-12), ONWARD), most)
+        excitation, run, effort = play(share)
+    peaks = _add_noise(controller, runs, _scale(excitation, per_given), options["sensors"])
+    if run is not None:
+        signals = {**run.outputs, controller.command.input: run.current}
+        peaks = {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+    return replace(excitation, peaks=peaks), effort, friction if dry else None
+
+
+def _scale(excitation: Excitation, per_given: float) -> Excitation:
+    """Return the reference of a law as it is given to what runs."""
+    return replace(excitation, waves=excitation.waves / per_given, bias=excitation.bias / per_given)
+
+
+def _run_terms(controller: Controller, runs: Controller, given: Excitation) -> LoopRun | None:
+    """Return the run of a reference where the law has terms, or where one set of phases follows another: its peaks may
+    be larger than those of the lines.
+    """
+    if controller.design is None or (controller.compensation is None and len(given.waves) == 1):
+        return None
+    return run_design(runs, [controller.design[1]], given.reference)
+
+
+def _measure_swing(controller: Controller, excitation: Excitation, run: LoopRun) -> float:
+    """Return the most by which the effort swings about its middle while the periods are played."""
+    period = excitation.waves.shape[1]
+    return float(np.ptp(run.current[0, period:-period])) / 2.0 / abs(controller.per_effort)
+
+
+def _add_noise(
+    controller: Controller, runs: Controller, given: Excitation, sensors: Sensors | None
+) -> dict[str, float]:
+    """Return the peaks of a reference where the readings have their noise and rounding: of the command, the plant and
+    what is read, those of `NOISE_RUNS` runs where they are larger. A reading's noise is drawn anew for its own peak,
+    which does not change how likely it is: white noise reaches the plant a sample later at the earliest.
+    """
+    peaks = dict(given.peaks)
+    if sensors is None or controller.design is None:
+        return peaks
+    plant, values = controller.design
+    noise = Sensors(noise_std=sensors.noise_std, quantisation=sensors.quantisation)
+    noise = noise.of(list_readings(runs, {"": plant}))
+    if not any((*noise.noise_std.values(), *noise.quantisation.values())):
+        return peaks
+    seen = controller.see(plant)
+    completed = seen.complete(controller.delay(values))
+    errors = {name: noise.combine_errors(seen, completed, name) for name in controller.signals if name in peaks}
+    for seed in range(NOISE_RUNS):
+        run = run_design(runs, [values], given.reference, sensors=noise, seed=seed)
+        signals = {**run.outputs, controller.command.input: run.current}
+        rng = np.random.default_rng((SEED, seed))
+        for name, (std, step) in errors.items():
+            signals[name] = np.abs(signals[name] + std * rng.normal(size=signals[name].shape)) + 0.5 * step
+        peaks = {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+    return peaks
+
+
+def _band(at: Float[np.ndarray, " m"], rows: Any) -> Band:
+    rows = np.asarray(rows)
+    return Band(
+        at=tuple(at.tolist()),
+        nominal=tuple(rows[0].tolist()),
+        low=tuple(np.min(rows, axis=0).tolist()),
+        high=tuple(np.max(rows, axis=0).tolist()),
+    )
