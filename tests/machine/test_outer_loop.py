@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -44,19 +45,21 @@ def damping():
     return make_knee(0.0)
 
 
-def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1):
+def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1, dry=0.0):
     """Return x_0, or the force asked for where the law has no stiffness, then the force reference, the torque, the
-    link's angle, and the command, a row per tick.
+    link's angle, and the command, a row per tick. `dry` is friction at the motor, N m, smoothed over 1 rad/s.
     """
     rng, outer = np.random.default_rng(seed), law.outer
     mass, kick = KNEE["N"] ** 2 * KNEE["J_m"], KNEE["N"] * KNEE["eta"] * KNEE["K_tau"]
-    a = np.zeros((5, 5))  # motor's angle at the output, its speed, the link's, its speed, current
+    a = np.zeros((6, 6))  # motor's angle at the output, its speed, the link's, its speed, current, friction
     a[0, 1] = a[2, 3] = 1.0
     a[1, [0, 2]], a[1, 1] = np.array([-1.0, 1.0]) * KNEE["k_s"] / mass, -(KNEE["N"] ** 2) * KNEE["b_r"] / mass
+    a[1, 5] = -KNEE["N"] / mass
     a[1, 4], a[3, [0, 2]] = kick / mass, np.array([1.0, -1.0]) * KNEE["k_s"] / INERTIA
     a[3, 3] = -DAMPER / INERTIA
-    moved = scipy.linalg.expm(a * T)
-    x, state, speed, before, waiting = np.zeros(5), np.zeros(law.law.c.size), 0.0, 0.0, 0.0
+    parts = 20 if dry else 1
+    moved = scipy.linalg.expm(a * T / parts)
+    x, state, speed, before, waiting = np.zeros(6), np.zeros(law.law.c.size), 0.0, 0.0, 0.0
     rows = np.empty((goal.size, 5))
     places = [0.0] * (late + 1)
     for k in range(goal.size):
@@ -73,7 +76,9 @@ def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1):
         current = effort * law.per_effort
         rows[k] = goal[k], asked, torque, angle, current
         x[4], waiting = waiting, current
-        x = moved @ x
+        for _ in range(parts):
+            x[5] = dry * math.tanh(KNEE["N"] * x[1])
+            x = moved @ x
     return rows
 
 

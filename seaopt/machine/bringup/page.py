@@ -182,7 +182,8 @@ def _describe_stage(stage: Stage) -> Section:
 def _describe_outer(stage: Stage, around: OuterExpected) -> Section:
     """Return what to play, to log and to expect with the outer loop closed."""
     controller, outer = around.controller, around.outer
-    given = f"x_0, in {around.unit}" if outer.stiffness else f"the force that the damping is added to, in {around.unit}"
+    what = "x_0" if outer.stiffness else "the force that the damping is added to"
+    given = f"{what}, {format_number(around.excitation.amplitude, 3)}{unit_after(around.unit)} at most"
     *before, command = stage.channels
     sentences = (
         PLAY_OUTER.format(outer.plant or "the plant of the link", stage.name, given) + _say_played(around),
