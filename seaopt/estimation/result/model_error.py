@@ -270,13 +270,16 @@ def _sum_parts(
                 part = np.minimum(order[rows] * PARTS // samples, PARTS - 1)
                 for k in range(int(part[0]), int(part[-1]) + 1):
                     chosen = slice(*np.searchsorted(part, [k, k + 1]))
-                    information[k] += _gram(weighted[:, :, chosen], along[:, :, chosen])
+                    gram = _multiply(weighted[:, :, chosen], along[:, :, chosen])
+                    information[k] += np.sum(gram, axis=0)
                     score[k] += np.sum(scores[:, chosen], axis=1)
+                    grams += gram if loss.quadratic else _multiply(along[:, :, chosen], along[:, :, chosen])
                 for s, mask in enumerate(high[:, rows]):
-                    half_information[s] += _gram(weighted * mask, along)
+                    within = np.compress(mask, along, axis=2)
+                    half = within if loss.quadratic else np.compress(mask, weighted, axis=2)
+                    half_information[s] += np.sum(_multiply(half, within), axis=0)
                 half_score += high[:, rows] @ scores.T
                 in_half += np.count_nonzero(high[:, rows], axis=1)
-                grams += np.matmul(along, along.transpose(0, 2, 1))
                 for o, rounding in enumerate(coarse):
                     if rounding is not None:
                         rounding.add(along[o], r[o], high[:, rows])
@@ -315,8 +318,8 @@ def _sum_parts(
     )
 
 
-def _gram(a: Float[np.ndarray, "ny q m"], b: Float[np.ndarray, "ny q m"]) -> ParameterMatrix:
-    return np.sum(np.matmul(a, b.transpose(0, 2, 1)), axis=0)
+def _multiply(a: Float[np.ndarray, "ny q m"], b: Float[np.ndarray, "ny q m"]) -> Float[np.ndarray, "ny q q"]:
+    return np.matmul(a, b.transpose(0, 2, 1))
 
 
 def _add_windows(
