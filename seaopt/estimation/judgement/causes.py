@@ -59,6 +59,7 @@ STILL, SLIGHT = 5, 0.1  # iterations in a row that gain so little of misfit end 
 SURE = 2.5  # standard deviations by which one of two is nearer to held-out samples
 COMPARES = 8  # evaluations that are kept for that: two fits near their minima take four
 PROMISES = 0.5  # of a gain that counts: what shows with coarse steps, the same in fit and refit, before finer are made
+SEEN = 1e-6  # probability below which a score is not chance
 FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free delay starts
 
 
@@ -126,9 +127,15 @@ def find_causes(
         kept = COMPARES if all(_find_rivals(fit, causes)) else 0
         try:
             with limit_evaluations(count_left() - kept):
-                solved = _refit(minimum, candidate, coarse, measure_misfit(fitted) + HOPELESS * fit.samples)
+                most = measure_misfit(fitted) + HOPELESS * fit.samples
+                solved = _refit(minimum, candidate, coarse, most)
                 if solved is None or not _promises(fit, candidate, coarse, rough, solved, colour):
-                    continue
+                    if not any(suspects[name].p < SEEN for name in candidate.frees if name in suspects):
+                        continue
+                    # What is seen to be wrong with the fit's steps, and not with coarse ones, bends as they do.
+                    solved = _refit(minimum, candidate, minimum.problem, most)
+                    if solved is None or not _promises(fit, candidate, minimum.problem, fitted, solved, colour):
+                        continue
                 before = _measure_kept(fit, minimum.problem, minimum.z, candidate.kept) if candidate.kept else whole
                 solved = refine_to(solved, minimum.problem)
         except BudgetError:

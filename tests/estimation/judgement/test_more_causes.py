@@ -126,6 +126,14 @@ def test_a_spring_in_which_something_slips_is_named():
     assert result.hypotheses[0].fixed["n_h"] > 3.0
 
 
+@pytest.mark.slow
+def test_how_sharply_it_slips_is_named_in_a_long_log_whose_residual_asks_for_coarse_steps():
+    """With them the blunt spring was the minimum, and v_s, which takes 3 % of the residual's power, was named."""
+    result = fit(record(slip=(30.0, 0.02), seconds=60.0), parts=("hysteresis",), k_h=30.0, y_h=0.02, n_h=5.3)
+    (cause,) = (finding for finding in result.findings if finding.kind == "cause")
+    assert cause.preferred["n_h"][0] > 15.0
+
+
 def test_a_spring_that_hardly_slips_is_as_stiff_as_without_what_slips():
     """Up to most of its deflection both springs are stiff together: the fit's stiffness is that of both."""
     check(fit(record(slip=(30.0, 0.1))), "hysteresis", k_h=30.0, y_h=0.1)
