@@ -392,7 +392,10 @@ def add_part(plant: Plant, part: str) -> Plant:
     else:
         check_parts((*recipe.parts, part))
         made = recipe.make((*recipe.parts, part))
-    return replace(made, sticks=plant.sticks and can_stick(made), drive_offset_s=plant.drive_offset_s)
+    sticks, offset = plant.sticks and can_stick(made), plant.drive_offset_s
+    if (made.sticks, made.drive_offset_s) == (sticks, offset):  # to make it again takes as long as to make it
+        return made
+    return replace(made, sticks=sticks, drive_offset_s=offset)
 
 
 @memo
