@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import seaopt as so
 from seaopt.bench import Chirp, Noise
-from seaopt.control import Controller, Impedance, add_impedance, cascade_pid, sweep
+from seaopt.control import Controller, Impedance, add_impedance, assess, cascade_pid, sweep
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
 from seaopt.control.impedance.rendering import apparent_impedance
@@ -386,7 +386,7 @@ def test_an_impedance_around_it_is_certified(tuned: Controller) -> None:
     assert again.outer == whole.outer
 
 
-def record_stand(*, seconds: float = 120.0, seed: int = 1) -> so.Log:
+def record_stand(*, seconds: float = 160.0, seed: int = 1) -> so.Log:
     """A log of the stand without friction, with noise on the torque and on the encoder."""
     parts = (Chirp(amplitude=2.0, f0_hz=0.1, f1_hz=150.0), Noise(std=1.0, band_hz=200.0))
     noise = so.Sensors(noise_std={"tau_s": 0.01, "theta_m": 1e-4})
@@ -443,12 +443,15 @@ def test_one_designed_on_measured_responses_keeps_its_limits_on_the_plant() -> N
     assert passed.met and not failed.met
     again = Controller.from_dict(json.loads(to_json(controller.to_dict())), response, SMOOTH)
     assert again.achieved.ms == pytest.approx(worst.ms, rel=1e-9)
+    own = assess(controller.law, response, SMOOTH, replace(SPEC, measured=("tau_s", "theta_m")))
+    assert own.structure == "custom" and own.achieved.ms == pytest.approx(worst.ms, rel=1e-9)
+    assert own.achieved.other_noise_gains == pytest.approx(worst.other_noise_gains, rel=1e-9)
 
 
 @pytest.mark.slow
 def test_those_tuned_on_logs_keep_their_limits_on_the_plant() -> None:
     for seed in range(100, 120):
-        response = so.measure_response(STAND, record_stand(seed=seed), ("tau_s", "theta_m"))
+        response = so.measure_response(STAND, record_stand(seconds=120.0, seed=seed), ("tau_s", "theta_m"))
         controller = so.tune(response, SMOOTH, SPEC)
         true = judge_by_hand(controller.law)
         assert controller.met and true["radius"] < 1.0 and true["ms"] <= 1.6 and true["mt"] <= 1.3, seed
