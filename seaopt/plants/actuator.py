@@ -55,6 +55,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -64,6 +65,7 @@ from seaopt.errors import PlantError
 from seaopt.parameters import Parameter
 from seaopt.plants import parts as part_laws
 from seaopt.plants.equations.stored_equations import store_function
+from seaopt.plants.memo import keep_last
 from seaopt.plants.parts import Part
 from seaopt.plants.plant import Derived, Plant
 from seaopt.plants.roles import (
@@ -306,15 +308,7 @@ def make_plant(
     frictions = _list_frictions(actuator, states, [parameter.name for parameter in parameters])
     bristled = [friction for friction in frictions.values() if friction.bristles is not None]
 
-    solved: tuple[list[dict[str, Any]], EquationsOfMotion] | None = None
-
-    def solve(*spaces: Any) -> EquationsOfMotion:
-        """Return the motion, of f and h of the same symbols the same: it takes most of the time of making a plant."""
-        nonlocal solved
-        given, last = [dict(vars(space)) for space in spaces], solved
-        if last is None or not all(map(_are_same, last[0], given)):
-            solved = last = given, solve_motion(actuator, *spaces)
-        return last[1]
+    solve = keep_last(partial(solve_motion, actuator))  # most of the time of making a plant
 
     def f(t: Any, x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         slips = {_get_bristles(friction).state: friction.find_rate(x, u, p) for friction in bristled}
@@ -368,11 +362,6 @@ def make_plant(
         mode=Mode(name="screw_mode_hz", parameter="m_n", state="s") if "screw_mode" in parts else None,
     )
     return part_laws.wrapped(plant, [part for part in parts if part not in part_laws.INSIDE])
-
-
-def _are_same(some: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
-    """Tell whether two sets of symbols by name are the very same."""
-    return some.keys() == others.keys() and all(some[name] is others[name] for name in some)
 
 
 def _rest(actuator: Actuator) -> SimpleNamespace:

@@ -80,7 +80,7 @@ from seaopt.errors import PlantError, suggestion
 from seaopt.parameters import Parameter, declare
 from seaopt.plants import drives
 from seaopt.plants.friction import can_stick
-from seaopt.plants.memo import memo
+from seaopt.plants.memo import keep_last, memo
 from seaopt.plants.motor import effects
 from seaopt.plants.motor.thermal import PARAMETERS, add_heat
 from seaopt.plants.plant import Plant, agree
@@ -434,6 +434,7 @@ def _add_filter(plant: Plant, part: str, signals: Sequence[str]) -> Plant:
         filters = law(p, parameter)
         return {**sources, **{s: ca.mtimes(filters.c, state(x, s)) + filters.d * sources[s] for s in signals}}
 
+    @keep_last
     def find_inputs(x: Any, u: Any, p: Any) -> SimpleNamespace:
         return SimpleNamespace(**replace_signals(vars(u), x, p)) if where == "input" else u
 

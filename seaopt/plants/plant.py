@@ -31,7 +31,7 @@ from seaopt.plants.equations.declaration import (
     stack_rows,
 )
 from seaopt.plants.equations.stored_equations import store_plant
-from seaopt.plants.memo import memo
+from seaopt.plants.memo import keep_last, memo
 from seaopt.plants.roles import (
     Actuation,
     Expression,
@@ -313,9 +313,10 @@ def extend(
     its parameters by p. `rates` and `readings`, of what the other sees, go beside its own or in their place, `added`
     beside its parameters, and `fields` in the place of its own.
     """
+    inputs, own = keep_last(find_inputs), keep_last(find_parameters)
 
     def widen(equations: Equations, more: Equations) -> Equations:
-        return lambda t, x, u, p: {**equations(t, x, find_inputs(x, u, p), find_parameters(p)), **more(t, x, u, p)}
+        return lambda t, x, u, p: {**equations(t, x, inputs(x, u, p), own(p)), **more(t, x, u, p)}
 
     parameters = {**plant.parameters, **{parameter.name: parameter for parameter in added}}
     fields = {"parameters": parameters, **fields}
