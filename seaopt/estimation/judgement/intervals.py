@@ -33,7 +33,7 @@ BLOCKS, EVENT = 64, 0.1  # of a log: in so many blocks an input moves or rests; 
 MOVES = 0.01  # of the block in which an input moves the most
 LOUD = 6.0  # standard deviations of a reading's noise in a block, above which it moves
 FOLLOWED = 30.0  # standard deviations by which the outputs follow what is small: a tenth off is three of them off
-MORE = 2.0  # times the variance by white noise of its size, that rounding makes of a value: worth a word
+MORE = 1.5  # times the variance by white noise of its size, that rounding makes of a value: worth a word
 READING = 0.05  # of a constant, up to which what is white about it is a reading's noise
 
 
