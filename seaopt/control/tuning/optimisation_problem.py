@@ -457,14 +457,14 @@ class Task:
         self, names: Sequence[str], grid: Grid, path: Path, plants: int | slice, law: LawResponse
     ) -> dict[str, np.ndarray]:
         """Return the usage of limits on plants with one path."""
-        discs, p = grid.discs.at(plants), path.y
+        discs, p = grid.discs.at(plants) if grid.in_discs else None, path.y
         open_loop = path.add_constant(law.c_v, law.c_r) - 1.0 + p * law.c_y
         distance = np.abs(1.0 + open_loop)
         out: dict[str, np.ndarray] = {}
-        measured = bool(np.any(discs.y))
+        discs = discs if discs is not None and np.any(discs.y) else None
         for name in names:
             curve, level = CURVES[name], grid.levels[name]
-            if measured:
+            if discs is not None:
                 out[name] = use_disc(curve, level, path, discs, law.c_y, law.c_r, law.c_v)
                 continue
             size = np.abs(curve.numerator(p, law.c_y, law.c_r, open_loop, law.c_v))
