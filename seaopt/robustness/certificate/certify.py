@@ -141,8 +141,9 @@ def certify(
     large_signals : bool
         With the simulations, sweep amplitudes for the curve of bandwidth against them, of which nothing is required.
     thorough : bool
-        False leaves out what takes long (friction margins that are not asked for, the impedance, simulations, the fit's
-        logs) once a requirement is not met: the certificate fails either way, and says less of it.
+        False leaves out friction margins at draws that are not asked for, and all that takes long (the impedance,
+        simulations, the fit's logs) once a requirement is not met: the certificate is met or not either way, and says
+        less of it.
     sensors, command_step
         Of the simulations, as in `Certificate.with_simulation`; their noise has the draws' seed.
     measured : mapping of name to MeasuredResponse, optional

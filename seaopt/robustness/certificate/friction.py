@@ -89,6 +89,9 @@ def find_margins_at_draws(context: CheckContext, nominal: Mapping[str, FrictionM
         for name, model in context.cases.models.items()
         if has_friction(model, unknown.nominal, varied) and _shows_enough(nominal.get(name), required)
     }
+    if required is None and not context.thorough:
+        judge_draws(context, MARGIN_DRAWS, dict.fromkeys(enough, _leave_out))  # the checks that follow draw the same
+        return {}
     return draw_margins(context, {name: partial(_find_margins, margin) for name, margin in enough.items()})
 
 
@@ -118,6 +121,11 @@ def _take_slope(margin: FrictionMargin | CompensationMargin | None) -> float:
 def _shows_enough(margin: FrictionMargin | None, required: float | None) -> bool:
     """Tell whether the nominal parameters leave something to look for at draws; without friction there they do."""
     return margin is None or margin.shown or (required is not None and margin.least_slope >= required)
+
+
+def _leave_out(cases: Shared[Cases], name: str, draws: Sequence[Draw]) -> list[None]:
+    """Return nothing of draws."""
+    return [None for _ in draws]
 
 
 def _find_margins(

@@ -52,11 +52,12 @@ def force():
     return so.tune(HELD, VALUES, so.ControllerSpec(measured="tau_s", bandwidth_hz=15, reserve=0.05))
 
 
-def certify(force, damping, ranges=None, values=VALUES, limit_A=None):
+def certify(force, damping, ranges=None, values=VALUES, limit_A=None, thorough=True):
     asked = Impedance(stiffness=40.0, damping=damping, velocity_filter_s=5e-3)
     limited = replace(force, spec=replace(force.spec, current_limit_A=limit_A))
     controller = add_impedance(limited, FREE, values, asked, name="free")
-    return so.certify(controller, {"free": FREE}, values, samples=5, ranges=ranges, simulations=False)
+    options = {"samples": 5, "ranges": ranges, "simulations": False, "thorough": thorough}
+    return so.certify(controller, {"free": FREE}, values, **options)
 
 
 @pytest.fixture(scope="module")
@@ -125,6 +126,14 @@ def test_friction_counts_sliding_and_stuck(force):
     assert certificate.impedance.stuck is not None
     rows = [row for row in certificate.requirements if row.name == "impedance_damper"]
     assert len(rows) == 2 and "stuck" in rows[1].where and rows[1].value < rows[0].value
+
+
+def test_friction_margins_that_nobody_asks_for_are_left_out_and_the_impedance_is_judged_at_the_same_draws(force):
+    rubbing, ranges = VALUES.update(f_c=1e-4, v_s=1.0), {"J_l": (0.2, 0.3)}
+    loose = replace(force, spec=replace(force.spec, max_sensitivity=2.0, max_complementary=2.0))
+    whole, brief = (certify(loose, 2.0, ranges, rubbing, 100.0, thorough) for thorough in (True, False))
+    assert whole.met and whole.friction_draws and not brief.friction_draws and "free" in brief.friction
+    assert brief.requirements == whole.requirements and brief.impedance.draws == whole.impedance.draws
 
 
 def test_a_simulated_step_is_that_of_the_equations(certificate):
