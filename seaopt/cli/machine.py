@@ -19,6 +19,7 @@ from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
 from seaopt.codec import from_content
 from seaopt.control import Controller, ForceMPC, MPCSpec, ScheduledController
+from seaopt.control.laws.delay import find_drive_delay
 from seaopt.control.mpc.stored import TUNE_AGAIN, check_described
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.files import read_json, to_json, write_json, write_text
@@ -44,6 +45,7 @@ from seaopt.signals import REFERENCE, STATUS
 
 FILE, PAGE = "acceptance.json", "acceptance.html"
 BRING_UP, PLAN = "bringup", "bringup.json"  # the folder of the stages, and what they are
+LATER = 5e-3  # s, by which a drive may be later than twice what it was
 AGAIN = "again"  # the folder of accepted logs, for a fit
 TABLES = """# A loop carries noise back into its command: fit such logs by prediction errors.
 # In the problem file: [fit] with method = "prediction_error", and these tables.
@@ -58,6 +60,7 @@ inputs = {{ {inputs} }}
 outputs = {{ {outputs} }}
 feedback = true
 """
+DELAYED = "delay_s = {{ value = {delay:.6g}, free = true, max = {most:.6g} }}\n"
 
 
 def accept_logs(
@@ -276,6 +279,7 @@ def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[st
 def write_again(result: Acceptance, session: Session) -> list[Path]:
     """Write the logs that are of the law as a fit takes them, and the tables of their experiments."""
     problem, folder, files, text = session.problem, session.folder / AGAIN, list[Path](), TABLES
+    delay = find_drive_delay(result.controller.spec, problem.design_plant, session.parameters())
     for number, (plant, log) in enumerate(result.experiments, start=1):
         name = next(name for name, each in problem.plants.items() if each is plant)
         stem = re.sub(r"\W+", "_", Path(log.source).stem) or "log"
@@ -288,6 +292,7 @@ def write_again(result: Acceptance, session: Session) -> list[Path]:
         )
         path = os.path.relpath(files[-1], problem.folder).replace(os.sep, "/")
         text += TABLE.format(name=label, plant=name, log=path, inputs=inputs, outputs=outputs)
+        text += DELAYED.format(delay=delay, most=2.0 * delay + LATER) if delay else ""
     return [*files, write_text(folder / "experiments.toml", text)] if files else []
 
 

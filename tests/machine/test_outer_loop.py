@@ -264,7 +264,8 @@ robustness = { plants = ["knee"], samples = 5 }
 
 def test_the_command_writes_it_as_an_experiment_of_the_links_plant(tmp_path):
     """The problem with the tables that are written reads back, and a fit with them starts."""
-    (tmp_path / "knee.toml").write_text(PROBLEM)
+    text = PROBLEM.replace("current_limit_A = 9.0,", "current_limit_A = 9.0, drive_delay_s = 4e-4,")
+    (tmp_path / "knee.toml").write_text(text)
     call, options = CliRunner().invoke, [str(tmp_path / "knee.toml"), "-o", str(tmp_path / "out")]
     assert call(app, ["tune", *options]).exit_code == 0
     problem = so.read_problem(tmp_path / "knee.toml")
@@ -275,8 +276,9 @@ def test_the_command_writes_it_as_an_experiment_of_the_links_plant(tmp_path):
     assert "experiments.toml" in done.output, done.output
     tables = (tmp_path / "out" / "again" / "experiments.toml").read_text()
     assert 'plant = "knee"' in tables and 'theta_l = "theta_l [rad]"' in tables
-    (tmp_path / "knee.toml").write_text(PROBLEM + tables)
+    (tmp_path / "knee.toml").write_text(text + tables)
     (experiment,) = so.read_problem(tmp_path / "knee.toml").experiments()
+    assert experiment.delay_s.value == 4e-4 and experiment.delay_s.free  # the drive's, behind the program's
     assert experiment.feedback and {"tau_s", "theta_l"} <= set(experiment.outputs)
 
 

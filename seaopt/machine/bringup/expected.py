@@ -29,6 +29,8 @@ STOP = 1.3  # times what is predicted: where to stop
 MOVES = 2.0  # times the dry friction: the effort that a stage's reference is to make where the limits leave room
 BARELY = 1.2  # times the dry friction: the effort where the limits leave no room for that
 RAISES, ONWARD = 4, 1.1  # times that an amplitude is raised to it, and by which factor at least
+SILENT = 1e-3  # share of the limits that a reference takes beside which noise is looked at by itself
+ROOM, LESS, LOWERS = 0.95, 0.85, 8  # of the limit of the command, below which peaks stay, and steps down to it
 SEED = 1
 NOISE_RUNS = 4  # with other noise each, whose largest peaks count
 PERIODS, PERIODS_OF_PHASES = 10, 4  # of one set of phases, and of each of six
@@ -146,6 +148,14 @@ def expect(
     }
 
 
+def find_noise(controller: Controller, options: Mapping[str, Any]) -> float:
+    """Return the peak of a law's command that the noise and the rounding of what it reads make by themselves."""
+    given: dict[str, Any] = {key: options[key] for key in ("limits", "seed")}
+    silent = design_excitation(controller, share=SILENT, bias=0.0, phases=1, periods=PERIODS, **given)
+    runs = replace(controller, outer=None)
+    return _add_noise(controller, runs, silent, options["sensors"])[controller.command.input]
+
+
 def split_limits(
     controller: Controller, limits: Mapping[str, float], link: tuple[Plant, ParameterSet] | None
 ) -> tuple[dict[str, float], dict[str, float]]:
@@ -217,11 +227,31 @@ def _excite(
             break
         share = min(share * max(MOVES * friction / max(effort, 1e-12), ONWARD), most)
         excitation, run, effort = play(share)
-    peaks = _add_noise(controller, runs, _scale(excitation, per_given), options["sensors"])
-    if run is not None:
-        signals = {**run.outputs, controller.command.input: run.current}
-        peaks = {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+    peaks = _find_peaks(controller, runs, excitation, run, per_given, options["sensors"])
+    limit, command = controller.command_limit, controller.command.input
+    for _ in range(LOWERS):  # a period in which the command is at its limit is lost for the response
+        if limit is None or peaks[command] < ROOM * limit:
+            break
+        share *= LESS
+        excitation, run, effort = play(share)
+        peaks = _find_peaks(controller, runs, excitation, run, per_given, options["sensors"])
     return replace(excitation, peaks=peaks), effort, friction if dry else None
+
+
+def _find_peaks(
+    controller: Controller,
+    runs: Controller,
+    excitation: Excitation,
+    run: LoopRun | None,
+    per_given: float,
+    sensors: Sensors | None,
+) -> dict[str, float]:
+    """Return the peaks of a reference and of its run, with the noise of what is read."""
+    peaks = _add_noise(controller, runs, _scale(excitation, per_given), sensors)
+    if run is None:
+        return peaks
+    signals = {**run.outputs, controller.command.input: run.current}
+    return {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
 
 
 def _scale(excitation: Excitation, per_given: float) -> Excitation:

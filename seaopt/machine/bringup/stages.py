@@ -21,6 +21,7 @@ from seaopt.machine.bringup.expected import (
     enclose_link,
     expect,
     expect_outer,
+    find_noise,
     split_limits,
 )
 from seaopt.machine.response.verdicts import find_friction
@@ -35,6 +36,7 @@ from seaopt.signals import REFERENCE
 BRINGUP_SCHEMA = "seaopt/bringup/1"
 FRACTIONS, FULL = (0.25, 0.5), "full"  # what the stages before the last ask for, and the name of the last
 UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
+NOISE_ROOM = 0.75  # of a stage's limit of its command, that noise alone may take
 DRAWS = 60
 STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
 OF_A_STAGE = (  # options of predictive control that a stage may have otherwise
@@ -264,8 +266,8 @@ def bring_up(
         progress(f"stage {len(stages) + 1} of {count}, {text}", len(stages) / count)
 
     for number, fraction in enumerate(sorted(fractions), start=1):
-        law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell, share)
         part = options | {"share": share * fraction, "most": share, "place": places[0]}
+        law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell, part)
         keep(_make_stage(f"stage_{number}", law, judged, note, draws, part))
     if certificate is None:
         tell("certifying the law itself")
@@ -322,11 +324,9 @@ def _find_stage(
     tuning: Callable[[float], Source],
     certifying: Callable[[Any], Certificate],
     tell: Callable[[str], None],
-    share: float,
+    options: Mapping[str, Any],
 ) -> tuple[Source, Certificate, str]:
-    """Return the law of a stage, its certificate, and in what it is another one than planned. `share`: of the limit of
-    its command that its reference may take.
-    """
+    """Return the law of a stage, its certificate, and in what it is another one than planned."""
     asked = source.spec.bandwidth_hz
     for factor in UPWARDS:
         part = fraction * factor
@@ -344,9 +344,14 @@ def _find_stage(
         if judged.met:
             note = "" if factor == 1.0 else f"{part * asked:.3g} Hz is the nearest to {asked * fraction:.3g} Hz"
             return law, judged, note
-    part = _reach_friction(stand(source, None), fraction, share)
+    own = stand(source, options["place"])
+    part, above = _reach_friction(own, fraction, options["most"]), ""
+    if part > fraction:
+        above = f", not {100.0 * fraction:g} %, which its reference takes to move the motor"
+    noise = find_noise(own, options) / (NOISE_ROOM * own.command_limit) if own.command_limit else 0.0
+    if part < noise < 1.0:
+        part, above = noise, f", not {100.0 * fraction:g} %, beside which the noise of what it reads has no room"
     lower = lower_effort(source, part)
-    above = "" if part == fraction else f", not {100.0 * fraction:g} %, which its reference takes to move the motor"
     note = (
         f"the full law with {100.0 * part:.3g} % of its effort{above}: none near {fraction:g} of its bandwidth is "
         "certified"
