@@ -13,14 +13,14 @@ ones average more.
 A lightly damped mode rings longer than any stretch: there the coherence is a lower bound of what a model could explain.
 
 Under a law the inputs carry the outputs' noise, and are coherent with it at all lines where the law reads it: only
-what was commanded before tells of the plant (Ljung, System Identification, 2nd ed., sec. 16.6). There what
-the residual's own past leaves of it is regressed on the inputs' sums over lags of 1, 2, 3, 4 to 5 ... samples.
-What the inputs account for of the output is then what the model does, and what they do of the residual.
+what was commanded before tells of the plant (Ljung, System Identification, 2nd ed., sec. 16.6). There what the past of
+all residuals leaves of one is regressed on the inputs' sums over lags of 1, 2 to 3, 4, 5 to 7 ... samples. What the
+inputs account for of the output is then what the model does, and what they do of the residual.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -43,7 +43,7 @@ TOGETHER = 16384  # samples of as many stretches as are transformed at once: the
 OUTLIER = 4.0  # robust standard deviations beyond which a residual is an outlier of its spectrum
 OCTAVES = 24  # below the Nyquist frequency, at most
 SILENT = 1e-9  # of an input's largest line
-PAST = 16  # samples of its own past that whiten a residual
+PAST = 32  # samples of the residuals' own past, before sums over longer ones
 LAG_RATIO, LONGEST_LAG = 2.0**0.5, 0.125  # of the ends of the sums of an input, and the last of them over the log
 ALIKE = 1e-10  # of the power of inputs that differ by less there is nothing left to rounding
 
@@ -67,10 +67,8 @@ def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals)
         return shares
     total = sum(rows.shape[1] for rows in inputs)
     if experiment.data.feedback:
-        rows = enumerate(experiment.data.outputs)
-        return {
-            name: _look_back(inputs, outputs, o, experiment.period) for o, name in rows if experiment.spread[o] > 0.0
-        }
+        found = zip(experiment.data.outputs, _look_back(inputs, outputs, experiment.period), strict=True)
+        return {name: share for o, (name, share) in enumerate(found) if experiment.spread[o] > 0.0}
     # Even, for stretches overlap by half, and without a prime factor above 5, for transforms are quick then.
     longest = (min(max(2 * total // count, SHORTEST), total) for count in STRETCHES)
     lengths = sorted({2 * find_quick_size_within(samples // 2) for samples in longest})
@@ -130,62 +128,98 @@ def _tame(error: Float[np.ndarray, "ny n"], used: Bool[np.ndarray, "ny n"]) -> F
 
 
 def _look_back(
-    inputs: Sequence[Float[np.ndarray, "m _"]], outputs: Sequence[Float[np.ndarray, "s _"]], o: int, period: float
-) -> CoherentShare:
-    """Return what the inputs before each sample account for, of an output of a log that was taken under a law."""
-    ny = len(outputs[0]) // 2
-    total = sum(rows.shape[1] for rows in inputs)
+    inputs: Sequence[Float[np.ndarray, "m _"]], outputs: Sequence[Float[np.ndarray, "s _"]], period: float
+) -> list[CoherentShare]:
+    """Return what the inputs before each sample account for, of each output of a log that was taken under a law."""
+    m, ny, total = len(inputs[0]), len(outputs[0]) // 2, sum(rows.shape[1] for rows in inputs)
     edges = np.unique(np.floor(LAG_RATIO ** np.arange(2.0 * np.log2(max(LONGEST_LAG * total, 4.0)))).astype(int))
-    errors = [rows[ny + o] - np.mean(rows[ny + o]) for rows in outputs]
-    own = np.vstack([_list_past(error) for error in errors])
-    columns, error = np.vstack([_sum_lags(u, edges) for u in inputs]), np.concatenate(errors)
-    white, columns = error - _regress(own, error[:, None])[:, 0], columns - _regress(own, columns)
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    values, vectors = np.linalg.eigh((columns / size).T @ (columns / size))
-    seen = values > ALIKE * values[-1]
-    across = vectors[:, seen].T @ ((columns / size).T @ white)
-    count, energy = int(np.count_nonzero(seen)), max(float(white @ white), 1e-300)
-    free = max(total - own.shape[1] - count, 1)
-    r2 = min(float(np.sum(across**2 / values[seen])) / energy, 1.0 - 1e-12)
-    p = exceeds(0.5 * count, 0.5 * free * r2 / (1.0 - r2))
-    residual = max((r2 - count / total) / (1.0 - count / total), 0.0)
-    explained = (columns / size) @ (vectors[:, seen] @ (across / values[seen]))
-    power = np.abs(np.fft.rfft(explained)) ** 2
-    f = np.fft.rfftfreq(explained.size, period)[1:]
-    octave = np.floor(np.log2(f[-1] / f)).astype(int)
-    most = f[octave == int(np.argmax(np.bincount(octave, weights=power[1:])[:OCTAVES]))]
-    measured = np.concatenate([rows[o] - np.mean(rows[o]) for rows in outputs])
-    left, whole = float(error @ error), max(float(measured @ measured), 1e-300)
-    share = float(np.clip(1.0 - (1.0 - residual) * left / whole, 0.0, 1.0))
-    return CoherentShare(
-        output=share,
-        residual=residual,
-        p=p,
-        band_hz=(float(most[0]), float(most[-1])),
-        power=residual * left / max(share * whole, 1e-300),
-    )
+    far = edges[np.searchsorted(edges, PAST) :]
+    errors = [rows[ny:] - np.mean(rows[ny:], axis=1, keepdims=True) for rows in outputs]
+    count = m * (edges.size - 1)
+    parts = [_Past.make(u, error, edges, far) for u, error in zip(inputs, errors, strict=True)]
+    gram = np.sum([rows.T @ rows for part in parts for rows in part.list_rows()], axis=0)
+    own = len(gram) - count - ny
+    kept, across = _invert(gram[:own, :own]), gram[:own, own:]
+    left = gram[own:, own:] - across.T @ kept @ across  # of inputs and residuals, what the residuals' past leaves
+    inverse = _invert(left[:count, :count])
+    rank = round(float(np.trace(inverse @ left[:count, :count])))
+    free = max(total - own - rank, 1)
+    shares = list[CoherentShare]()
+    for o in range(ny):
+        gain = inverse @ left[:count, count + o]
+        r2 = float(np.clip(gain @ left[:count, count + o] / max(left[count + o, count + o], 1e-300), 0.0, 1.0 - 1e-12))
+        residual = max((r2 - rank / total) / max(1.0 - rank / total, 1e-12), 0.0)
+        made = [rows[:, own : own + count] @ gain for part in parts for rows in part.list_rows()]
+        power = np.abs(np.fft.rfft(np.concatenate(made))) ** 2
+        f = np.fft.rfftfreq(total, period)[1:]
+        octave = np.floor(np.log2(f[-1] / f)).astype(int)
+        most = f[octave == int(np.argmax(np.bincount(octave, weights=power[1:])[:OCTAVES]))]
+        measured = np.concatenate([rows[o] - np.mean(rows[o]) for rows in outputs])
+        error, whole = gram[own + count + o, own + count + o], max(float(measured @ measured), 1e-300)
+        share = float(np.clip(1.0 - (1.0 - residual) * error / whole, 0.0, 1.0))
+        shares.append(
+            CoherentShare(
+                output=share,
+                residual=residual,
+                p=exceeds(0.5 * rank, 0.5 * free * r2 / (1.0 - r2)) if rank else 1.0,
+                band_hz=(float(most[0]), float(most[-1])),
+                power=float(residual * error / max(share * whole, 1e-300)),
+            )
+        )
+    return shares
 
 
-def _sum_lags(u: Float[np.ndarray, "m n"], edges: Int[np.ndarray, " k"]) -> Float[np.ndarray, "n c"]:
-    """Return the sums of each input over the samples before each one, from an edge to the next; ahead of the first
-    sample it is what it is on the mean.
-    """
-    before = np.cumsum(u - u.mean(axis=1, keepdims=True), axis=1)
-    before = np.hstack([np.zeros((len(u), edges[-1] + 1)), before])  # column edges[-1] + k: of all samples before k
-    n, last = u.shape[1], edges[-1]
-    parts = [before[:, last + 1 - a : last + 1 - a + n] for a in edges]
-    return np.vstack([near - far for near, far in pairwise(parts)]).T
+@record(eq=False)
+class _Past:
+    """What was before each sample of a segment: sums of signals up to each one, and their lags."""
+
+    error: Float[np.ndarray, "ny n"]
+    sums: tuple[tuple[Float[np.ndarray, "m _"], Int[np.ndarray, " k"]], ...]
+    whole: Float[np.ndarray, "k n"]  # a constant, and the integrals of the residuals, once and again
+
+    @classmethod
+    def make(
+        cls,
+        u: Float[np.ndarray, "m n"],
+        error: Float[np.ndarray, "ny n"],
+        edges: Int[np.ndarray, " k"],
+        far: Int[np.ndarray, " _"],
+    ) -> _Past:
+        integral = np.cumsum(error, axis=1) - error  # which a law may have, and again
+        near = np.arange(1, PAST + 2)
+        sums = [(error, near), *([(error, far)] if far.size > 1 else []), (u, edges)]
+        return cls(
+            error=error,
+            sums=tuple((_sum_up(signals, int(lags[-1])), lags) for signals, lags in sums),
+            whole=np.vstack([np.ones(error.shape[1]), integral, np.cumsum(integral, axis=1)]),
+        )
+
+    def list_rows(self) -> Iterator[Float[np.ndarray, "n c"]]:
+        """Yield rows, some at a time: what is known of the residuals, the sums of the inputs, and the residuals."""
+        n = self.error.shape[1]
+        for a in range(0, n, TOGETHER):
+            b = min(a + TOGETHER, n)
+            *own, inputs = (_cut_lags(sums, lags, a, b) for sums, lags in self.sums)
+            yield np.vstack([*own, self.whole[:, a:b], inputs, self.error[:, a:b]]).T
 
 
-def _list_past(error: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
-    """Return the samples before each one, and a constant."""
-    padded = np.concatenate([np.zeros(PAST), error[:-1]])
-    return np.column_stack([np.lib.stride_tricks.sliding_window_view(padded, PAST), np.ones(error.size)])
+def _sum_up(signals: Float[np.ndarray, "m n"], last: int) -> Float[np.ndarray, "m _"]:
+    """Return sums of signals, about their means; ahead of the first sample they are zero for `last` + 1 columns."""
+    sums = np.cumsum(signals - signals.mean(axis=1, keepdims=True), axis=1)
+    return np.hstack([np.zeros((len(signals), last + 1)), sums])
 
 
-def _regress(columns: Float[np.ndarray, "n k"], values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n c"]:
-    """Return the part of values that columns make."""
-    return columns @ np.linalg.lstsq(columns.T @ columns, columns.T @ values, rcond=1e-12)[0]
+def _cut_lags(sums: Float[np.ndarray, "m _"], lags: Int[np.ndarray, " k"], a: int, b: int) -> Float[np.ndarray, "c n"]:
+    """Return the sums of each signal over the samples before each of some, from a lag to the next."""
+    first = int(lags[-1]) + 1
+    parts = [sums[:, first - lag + a : first - lag + b] for lag in lags]
+    return np.vstack([near - far for near, far in pairwise(parts)])
+
+
+def _invert(gram: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
+    """Return the inverse of sums of products, without directions that rounding alone keeps apart."""
+    size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    return np.linalg.pinv(gram / np.outer(size, size), rcond=ALIKE, hermitian=True) / np.outer(size, size)
 
 
 @record(eq=False)

@@ -68,7 +68,7 @@ def test_noise_that_goes_round_the_loop_is_not_said_to_follow_the_input():
     assert not taken_for_open.met and taken_for_open.findings
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.9])
+@pytest.mark.parametrize("lag", [0.0, 0.9, 0.999])
 def test_the_probability_of_a_right_model_is_uniform(lag):
     """Kolmogorov and Smirnov's test over 40 logs, the plant known, of white and of coloured noise."""
     found = []
