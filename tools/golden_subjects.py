@@ -252,7 +252,8 @@ def state_worst(certificate: dict[str, Any]) -> dict[str, Any]:
     """
     for plant in certificate["plants"].values():
         worst = plant["worst"]
-        worst |= {name: place(worst[name], 1e-3) for name in ("parameters", "ms", "mt", "ms_hz", "spectral_radius")}
+        worst |= {name: place(worst[name], 1e-3) for name in ("parameters", "ms_hz")}
+        worst |= {name: place(worst[name], 1e-5) for name in ("ms", "mt", "spectral_radius")}
         worst["severity"] = place(worst["severity"], 1e-7)
         for largest in worst["largest"].values():
             largest |= {"value": place(largest["value"], 1e-7), "parameters": place(largest["parameters"], 1e-3)}
