@@ -352,7 +352,7 @@ def _has_commands(ticks: Ticks, row: Replay) -> bool:
 
 def _find_plant(law: Controller, ticks: Ticks, link: tuple[Plant, ParameterSet] | None) -> Plant | None:
     """Return the plant that a log is of: where the outer loop ran, that of its link. None where that is not known."""
-    found = law.design if ticks.rendered is None else link
+    found = (law.design or law.measured_on) if ticks.rendered is None else link
     return None if found is None else found[0]
 
 

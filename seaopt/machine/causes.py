@@ -49,6 +49,7 @@ MUCH = 0.5  # of the mismatch's energy, which a first cause of two removes
 LESS = 0.1  # of what a single cause leaves: another set of gains, which has more to fit, leaves less
 FITTED = ("gain", "factor")  # kinds with a size that is fitted
 MOST_CAUSES = 6
+REFINES = 3  # replays that a factor of a schedule's command takes
 MOST_ROWS = 50_000  # about the largest mismatch, on which edits of a table are tried: the variable has to move in them
 ASKED = "the outer loop's output"
 SHORT = {"gain": "short, gain", "factor": "short, factor", "late": "short, late"}  # more periods would tell these
@@ -126,6 +127,7 @@ class Alternative:
     gains: Mapping[str, float] | None = None
     exported: Mapping[str, float] | None = None
     edited: Edited | None = None
+    fitted: bool = False  # its value is the one that explains most
 
 
 def find_causes(whole: Setting, match: Match, others: Others) -> tuple[tuple[Cause, ...], Setting]:
@@ -264,7 +266,7 @@ def _rank(pair: Tried) -> tuple[bool, bool, bool, float]:
     limit many do: a sign runs away, a unit seldom does.
     """
     alternative, match = pair
-    fitted, unit = alternative.kind in FITTED, alternative.kind == "unit"
+    fitted, unit = alternative.fitted or alternative.kind in FITTED, alternative.kind == "unit"
     return not match.met, match.met and fitted, match.met and unit, match.energy
 
 
@@ -293,7 +295,7 @@ def _play_each(setting: Setting, alternatives: Iterable[Alternative]) -> Iterato
         except SeaoptError:  # a law that cannot run so
             continue
         if np.isfinite(played.energy):
-            yield alternative, played
+            yield alternative, replace(played, allowed=0.0 * played.allowed) if played.coarse else played
 
 
 def list_alternatives(setting: Setting, others: Others) -> Iterator[Alternative]:
@@ -360,6 +362,8 @@ def _scale(what: str, factor: float, setting: Setting) -> Setting:
 def _list_factors(setting: Setting) -> Iterator[Alternative]:
     """Yield signs, units and other factors of reference, readings and command."""
     fitted = _fit_factors(setting)
+    if isinstance(setting.law, RunnableSchedule) and setting.controller.command.input in fitted:
+        fitted |= _refine_command(setting, fitted[setting.controller.command.input])
     for what in (
         *(setting.ticks.rendered or ()),
         _name_reference(setting.ticks),
@@ -376,6 +380,20 @@ def _list_factors(setting: Setting) -> Iterator[Alternative]:
                 value=value,
                 change=lambda given, what=what, value=value: _scale(what, value, given),
             )
+
+
+def _refine_command(setting: Setting, factor: float) -> dict[str, float]:
+    """Return the factor of a schedule's command, by replays as its variable moves: the linear law is that of its
+    middle.
+    """
+    name = setting.controller.command.input
+    for _ in range(REFINES):
+        played = play(_scale(name, factor, setting))
+        size = float(played.commands @ played.commands)
+        factor *= float((played.commands - played.error) @ played.commands) / size if size else 1.0
+        if not math.isfinite(factor) or not factor:
+            return {}
+    return {name: factor}
 
 
 def _name_reference(ticks: Ticks) -> str:
@@ -491,7 +509,7 @@ def _list_places(setting: Setting) -> Iterator[Alternative]:
         change = _change_ticks(lambda rows: _shift_place(rows, shift))
         still = np.ptp(place) <= SAME_PLACE * (points[-1] - points[0])
         kind, value = ("place", float(np.median(place)) + shift) if still else ("shift", shift)
-        yield Alternative(kind=kind, what=over, value=value, unit=law.table.unit, change=change)
+        yield Alternative(kind=kind, what=over, value=value, unit=law.table.unit, change=change, fitted=True)
 
 
 def _fit_place(setting: Setting) -> float | None:

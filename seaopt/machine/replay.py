@@ -26,7 +26,6 @@ from seaopt.records import record
 
 SIGMAS = 4.0  # of what rounding allows
 HIDES = 0.003  # of the command's rms, above which what is taken for rounding may be a fault
-COARSEST = 0.1  # of the command's rms, that rounding may allow of a replay that decides
 
 
 @record
@@ -98,7 +97,7 @@ def replay(source: Source, ticks: Ticks, others: Others | None = None) -> Replay
     allowed, rms = math.sqrt(float(np.mean(match.allowed**2))), float(np.std(ticks.command))
     if match.met and not causes and match.energy > (FLOOR * rms) ** 2:
         causes = find_hidden(whole, match, others or {})
-    if match.met and not causes and allowed > COARSEST * rms:
+    if match.met and not causes and match.coarse:
         causes = (leave_open("rounding", "log", allowed),)
     met = match.met and not causes
     off = np.flatnonzero(np.abs(match.error) > SIGMAS * match.allowed)

@@ -48,6 +48,7 @@ from seaopt.records import record
 from seaopt.robustness import linear_controller
 
 SETTLED = 400  # rows over which the estimate of predictive control follows the log
+COARSEST = 0.1  # of the command's rms, that rounding may allow of a replay that decides
 SAME_PLACE = 0.02  # of the span of a schedule's points: a variable that moves less stands still
 FLOOR = 1e-3  # of the command's variation: a mismatch below is none
 EXACT = 1e-3  # of that, below which a start is the right one
@@ -202,6 +203,12 @@ class Match:
     def energy(self) -> float:
         """Mean square of the difference."""
         return float(np.mean(self.error**2))
+
+    @property
+    def coarse(self) -> bool:
+        """Whether rounding allows so much of the command that any law may be met."""
+        logged = self.commands - self.error
+        return math.sqrt(float(np.mean(self.allowed**2))) > COARSEST * float(np.std(logged))
 
     @property
     def met(self) -> bool:
@@ -439,6 +446,8 @@ def find_offset(
     if not step or not count_integrals(law) or np.all(limited):
         return 0.0, np.zeros(len(ticks))
     steady = np.where(limited, 0.0, find_steady(law, limited))
+    if not np.any(steady):  # no row within the limit has seen the reference
+        return 0.0, steady
     return float(np.clip(steady @ error / (steady @ steady), -0.5 * step, 0.5 * step)), steady
 
 

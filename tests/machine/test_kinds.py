@@ -109,6 +109,19 @@ def test_a_moving_variable_that_was_logged_with_an_offset_is_named_with_it(sched
     assert "N/m added to what was logged" in say_cause(cause)
 
 
+@pytest.mark.parametrize(
+    ("factor", "decimals", "moving"),
+    [(1.01, 2, False), (1.02, 1, False), (1.02, 2, False), (1.02, 2, True), (1.05, 2, True)],
+)
+def test_a_factor_is_not_taken_for_another_place(schedule, scheduled, factor, decimals, moving):
+    """With coarse digits a fitted place explains it, too, and leaves more."""
+    wave = 1e5 * np.sin(2e-3 * np.arange(REFERENCE.size)) * moving
+    log = scheduled.log(SOFT, REFERENCE, places=6.2e5 + wave, decimals=decimals)
+    columns = {"reference": log["reference"], "F1": log["F1"], "I": factor * log["I"], "k": 6.2e5 + wave}
+    (row,) = so.accept(schedule, [so.Log.from_arrays(time=log.time, **columns)]).replays
+    assert not row.met and row.causes[0].what == "I" and row.causes[0].value == pytest.approx(factor, abs=2e-3), row
+
+
 def replace_place(log, places):
     return so.Log.from_arrays(**{name: log[name] for name in ("reference", "I", "F1")}, time=log.time, k=places)
 

@@ -405,3 +405,20 @@ def test_a_log_that_begins_amid_single_ticks_at_the_limit_is_of_its_law(controll
     assert limited.size > 20 and np.all(np.diff(limited) > 1)
     (row,) = so.accept(controller, [run.between(0.105, 3.9)]).replays
     assert row.met and row.mismatch < 1e-9 and row.saturated > 0.0
+
+
+def test_a_reference_of_coarse_steps_that_allows_any_law_explains_nothing(controller, bench):
+    """As a column of another signal: its rounding allows more than the command."""
+    log = bench.log(Machine(), REFERENCE)
+    other = 4000.0 * np.round(np.cumsum(np.random.default_rng(1).normal(size=len(log))) / 10.0)
+    columns = {name: log[name] for name in ("F1", "I")}
+    wrong = so.Log.from_arrays(time=log.time, reference=other, **columns)
+    slower = so.tune(*controller.design, replace(controller.spec, bandwidth_hz=20))
+    (row,) = so.accept(controller, [wrong], others={"older.json": slower}).replays
+    assert not row.met and not any(cause.explains for cause in row.causes), row.causes
+
+
+def test_a_law_designed_on_a_response_has_its_log_as_an_experiment_of_the_plant_that_was_measured(controller, bench):
+    law = replace(controller, design=None, measured_on=controller.design)
+    ((plant, _),) = so.accept(law, [bench.log(Machine(), REFERENCE)]).experiments
+    assert plant is controller.design[0]
