@@ -275,7 +275,15 @@ def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(compiler
     )
     assert np.max(np.abs(log["I"])) < stage.controller.command_limit < 15.0
     result = so.accept(stage.controller, [log])
-    assert result.replayed and result.response is not None and not result.left_out
+    assert result.replayed and result.response is not None
+    # The noise shakes the motor through its friction: compared without it, v_s was 1.8 times what it is.
+    assert result.differences is None and "play a larger amplitude" in result.left_out["differences"]
+    assert len(plan.stages) == 2
+    (tmp_path / "full").mkdir()
+    full = Bench(compiler, tmp_path / "full", law).log(
+        Machine.of_knee(values), plan.stages[1].excitation.reference, noise=0.05
+    )
+    assert so.accept(law, [full]).met
 
 
 def test_expected_peaks_contain_the_noise_of_what_is_read(controller, compiler, tmp_path):

@@ -46,6 +46,7 @@ from seaopt.machine.response.judged import Judged, Measured, Outcome, Prediction
 from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import Blocks
 from seaopt.machine.response.reach import Band, find_missing, find_reach
+from seaopt.machine.ticks import Ticks
 from seaopt.plants.friction import find_dry_friction, split_friction
 from seaopt.records import record
 
@@ -58,6 +59,7 @@ SHORT_BY = 0.1  # of the bandwidth
 CENTRE = 1.0 - 1e-9  # a risk at which discs are points
 MOST_PERIODS = 1e6  # that are counted
 TRACKING = ("reference peak", "bandwidth")
+GRID = 400  # frequencies over which a law's response to noise is averaged
 HOUR = 3600.0  # s: a record that is longer is not asked for
 
 
@@ -137,6 +139,18 @@ def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
         "tracking_im": np.imag(part.tracking.value),
         "tracking_radius": part.tracking.disc(alpha)[1],
     }
+
+
+def find_noise_share(controller: Controller, ticks: Ticks) -> float:
+    """Return the share of the command's rms that the noise of what is read makes, taken as white: from third
+    differences of the readings, which motions hardly have.
+    """
+    f = np.linspace(0.0, 0.5 / controller.sample_time_s, GRID + 2)[1:-1]
+    third = np.diff(ticks.measured, 3, axis=0)
+    std = 1.4826 * np.nanmedian(np.abs(third), axis=0) / np.sqrt(20.0)
+    power = np.mean(np.abs(controller.law.responses(f)[1:]) ** 2, axis=1)
+    noise = abs(controller.per_effort) * float(np.sqrt(std**2 @ power))
+    return noise / max(float(np.nanstd(ticks.command)), 1e-300)
 
 
 def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured:
