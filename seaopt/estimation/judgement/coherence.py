@@ -175,7 +175,7 @@ class _Past:
 
     error: Float[np.ndarray, "ny n"]
     sums: tuple[tuple[Float[np.ndarray, "m _"], Int[np.ndarray, " k"]], ...]
-    whole: Float[np.ndarray, "k n"]  # a constant, and the integrals of the residuals, once and again
+    whole: Float[np.ndarray, "w n"]  # a constant, and the integrals of the residuals, once and again
 
     @classmethod
     def make(
