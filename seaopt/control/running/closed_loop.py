@@ -338,7 +338,7 @@ def _first_guess(a: Float[np.ndarray, "nx nx"], period: float, rtol: float) -> i
 
 def _push_at_start(plant: Plant, params: CompletedParameters, x: Float[np.ndarray, " nx"]) -> Float[np.ndarray, " nx"]:
     """Return the rates of the states at the start, without a command: what friction there holds, such as cogging."""
-    return np.array(dynamics_function(plant)(x, np.zeros(len(plant.inputs)), params.vector)).ravel()
+    return dynamics_function(plant)(x, np.zeros(len(plant.inputs)), params.vector).full().ravel()
 
 
 def _bound_motion(
