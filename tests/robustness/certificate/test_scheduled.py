@@ -71,6 +71,12 @@ def test_what_is_of_one_law_is_drawn_at_a_place_alone(certificate):
     assert {*plates} == {"loop", "schedule"} and not plates["loop"].heading  # of the law on its design plant
 
 
+def test_the_certificate_of_each_place_prints_itself_between_the_points_too(certificate):
+    assert any(not place.margins for place in certificate.places)
+    for place in certificate.places:
+        assert "Margins on every plant" in repr(place)
+
+
 def test_every_stretch_is_proved_and_above_what_was_found(certificate):
     assert all(one.shown for one in certificate.stretches) and len(certificate.stretches) == 16
     largest = max(loop.ms for place in certificate.places for loop in place.plants.values())

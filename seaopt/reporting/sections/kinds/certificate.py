@@ -26,7 +26,7 @@ from seaopt.reporting.sections.data import (
 from seaopt.reporting.sections.kinds.controller import explain_sliding, show_costs
 from seaopt.reporting.sections.kinds.simulated import list_left_out, summarise_findings
 from seaopt.reporting.sections.kinds.verification import describe_steps
-from seaopt.robustness import Certificate
+from seaopt.robustness import Certificate, PlantMargins
 from seaopt.robustness.certificate.certificate import NO_MODEL
 from seaopt.robustness.certificate.compensation import GRAVITY_COMPENSATION
 from seaopt.robustness.certificate.requirement import DESIGN_PLANT, Failure, Requirement, group_failures
@@ -252,11 +252,11 @@ def _swings(certificate: Certificate) -> bool:
 def _tabulate_margins(certificate: Certificate) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, figures in certificate.plants.items():
-        worst, margins = certificate.worst[name], certificate.margins[name]
+        worst = certificate.worst[name]
+        margins = certificate.margins.get(name)  # none between the points of a schedule
         if not figures.stable:
             rows.append((name, Mark(text="unstable", style="bad"), *[MISSING] * 10))
             continue
-        late = margins.sampled_delay_s
         rows.append(
             (
                 name,
@@ -264,18 +264,24 @@ def _tabulate_margins(certificate: Certificate) -> Table:
                 f"{worst.ms:.3f}",
                 f"{figures.mt:.3f}",
                 f"{worst.mt:.3f}",
-                format_number(margins.margins.gain_up_db, 3),
+                format_number(margins and margins.margins.gain_up_db, 3),
                 format_number(figures.phase_margin_deg, 3),
-                f"{1e3 * late:.3g}" if late is not None else f"> {1e3 * margins.searched_delay_s:.2g}",
+                MISSING if margins is None else _format_delay(margins),
                 format_number(figures.disk_margin, 3),
                 format_band(figures.tracking_band_hz, missing=MISSING),
                 format_number(figures.bandwidth_hz),
-                format_number(margins.margins.gain_down_db, 3),
+                format_number(margins and margins.margins.gain_down_db, 3),
             )
         )
     head = ("plant", "Ms", "worst Ms", "Mt", "worst Mt", "gain dB", "phase °", "delay ms", "disk")
     more = ("tracking band Hz", "bandwidth Hz", "gain down dB")
     return Table(head=(*head, *more), rows=tuple(rows), align="<".ljust(12, ">"), optional=more)
+
+
+def _format_delay(margins: PlantMargins) -> str:
+    """Return the delay, in ms, by which a loop may be later."""
+    late = margins.sampled_delay_s
+    return f"> {1e3 * margins.searched_delay_s:.2g}" if late is None else f"{1e3 * late:.3g}"
 
 
 def _describe_simulation(certificate: Certificate) -> Iterator[str]:
