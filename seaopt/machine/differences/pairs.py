@@ -60,6 +60,8 @@ def find_pairs(
 def _begin(start: Start, knobs: Sequence[Knob], values: ParameterSet, spread: Spread) -> list[Search]:
     """Return a single cause with each of the others beside it, some rounds of the search from none of these on."""
     comparison, knob = start.comparison, start.knob
+    if comparison.simulates:  # as behind a drive's limit: no loop is simulated earlier
+        knobs = [replace(other, earliest=0.0) for other in knobs]
     (model,) = comparison.predict([knob.place(values, start.size)])
     slopes = find_slopes(comparison, spread, knob.place(values, start.size), model)
     begun = [
