@@ -144,16 +144,16 @@ def _look_back(
     inverse = _invert(left[:count, :count])
     rank = round(float(np.trace(inverse @ left[:count, :count])))
     free = max(total - own - rank, 1)
+    gains = inverse @ left[:count, count:]
+    made = np.concatenate([rows[:, own : own + count] @ gains for part in parts for rows in part.list_rows()])
+    f = np.fft.rfftfreq(total, period)[1:]
+    octave = np.floor(np.log2(f[-1] / f)).astype(int)
     shares = list[CoherentShare]()
-    for o in range(ny):
-        gain = inverse @ left[:count, count + o]
+    for o, gain in enumerate(gains.T):
         r2 = float(np.clip(gain @ left[:count, count + o] / max(left[count + o, count + o], 1e-300), 0.0, 1.0 - 1e-12))
         residual = max((r2 - rank / total) / max(1.0 - rank / total, 1e-12), 0.0)
-        made = [rows[:, own : own + count] @ gain for part in parts for rows in part.list_rows()]
-        power = np.abs(np.fft.rfft(np.concatenate(made))) ** 2
-        f = np.fft.rfftfreq(total, period)[1:]
-        octave = np.floor(np.log2(f[-1] / f)).astype(int)
-        most = f[octave == int(np.argmax(np.bincount(octave, weights=power[1:])[:OCTAVES]))]
+        power = np.abs(np.fft.rfft(made[:, o])[1:]) ** 2
+        most = f[octave == int(np.argmax(np.bincount(octave, weights=power)[:OCTAVES]))]
         measured = np.concatenate([rows[o] - np.mean(rows[o]) for rows in outputs])
         error, whole = gram[own + count + o, own + count + o], max(float(measured @ measured), 1e-300)
         share = float(np.clip(1.0 - (1.0 - residual) * error / whole, 0.0, 1.0))
