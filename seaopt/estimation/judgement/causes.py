@@ -127,15 +127,13 @@ def find_causes(
         kept = COMPARES if all(_find_rivals(fit, causes)) else 0
         try:
             with limit_evaluations(count_left() - kept):
-                most = measure_misfit(fitted) + HOPELESS * fit.samples
-                solved = _refit(minimum, candidate, coarse, most)
-                if solved is None or not _promises(fit, candidate, coarse, rough, solved, colour):
-                    if not any(suspects[name].p < SEEN for name in candidate.frees if name in suspects):
-                        continue
-                    # What is seen to be wrong with the fit's steps, and not with coarse ones, bends as they do.
-                    solved = _refit(minimum, candidate, minimum.problem, most)
-                    if solved is None or not _promises(fit, candidate, minimum.problem, fitted, solved, colour):
-                        continue
+                steps = [(coarse, rough)]
+                seen = any(suspects[name].p < SEEN for name in candidate.frees if name in suspects)
+                if seen and coarse is not minimum.problem:
+                    steps.append((minimum.problem, fitted))  # what coarse steps hide, for it bends as they do
+                solved = next(_list_promising(fit, candidate, steps, measure_misfit(fitted), colour), None)
+                if solved is None:
+                    continue
                 before = _measure_kept(fit, minimum.problem, minimum.z, candidate.kept) if candidate.kept else whole
                 solved = refine_to(solved, minimum.problem)
         except BudgetError:
@@ -186,12 +184,21 @@ def _measure_powers(evaluation: Evaluation, problem: FitProblem) -> Float[np.nda
     return np.maximum(np.concatenate(rows), 1e-24)
 
 
-def _promises(
-    fit: Fit, candidate: Candidate, coarse: FitProblem, rough: Evaluation, solved: Solved, colour: float
-) -> bool:
-    """Tell whether a refit may gain what counts over the fit with the same steps, whose minimum is `rough`."""
-    before = _measure_kept(fit, coarse, rough.z, candidate.kept) if candidate.kept else _measure_powers(rough, coarse)
-    return _measure_gain(before, solved) > PROMISES * ENOUGH * colour
+def _list_promising(
+    fit: Fit, candidate: Candidate, steps: Sequence[tuple[FitProblem, Evaluation]], misfit: float, colour: float
+) -> Iterator[Solved]:
+    """Yield refits that may gain what counts over the fit with the same steps. `steps`: problems with those to search
+    with, and the fit's minimum there; `misfit`: of the fit.
+    """
+    minimum = fit.require_minimum("find_causes")
+    for problem, there in steps:
+        solved = _refit(minimum, candidate, problem, misfit + HOPELESS * fit.samples)
+        if solved is None:
+            continue
+        kept = candidate.kept
+        before = _measure_kept(fit, problem, there.z, kept) if kept else _measure_powers(there, problem)
+        if _measure_gain(before, solved) > PROMISES * ENOUGH * colour:
+            yield solved
 
 
 def _measure_kept(
