@@ -50,6 +50,15 @@ def test_the_limit_of_a_drive_is_named_with_its_size(controller, bench, bias, sh
     assert f"the drive gives at most {first.value:.3g} A" in " ".join(str(result).split())
 
 
+@pytest.mark.parametrize("late", [0.4, 0.75])
+def test_a_loop_that_is_earlier_besides_is_not_simulated(controller, bench, late):
+    """Of a limited drive the model is simulated, and no simulated loop is earlier than its ticks."""
+    command = np.abs(bench.log(RIGHT, REFERENCE, noise=0.5)["I"][1000:])
+    machine = replace(RIGHT, late=late, drive_limit=0.6 * float(np.max(command)))
+    result = accept(controller, bench.log(machine, REFERENCE, noise=2.0))
+    assert result.replayed and not result.met and result.differences.found
+
+
 @pytest.mark.parametrize("gain", [0.85, 0.6])
 def test_a_smaller_gain_is_no_limit(controller, bench, gain):
     result = accept(controller, bench.log(replace(RIGHT, per_ampere=gain * RIGHT.per_ampere), REFERENCE, noise=0.5))
