@@ -31,7 +31,7 @@ from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_bl
 from seaopt.machine.response.reported import Reported, read_status
 from seaopt.machine.response.tripped import Trip, find_refused, find_trip
 from seaopt.machine.response.verdicts import Response, find_noise_share, has_dry_friction, judge_response
-from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand
+from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand, stands_still
 from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference_unit, take_ticks
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -426,8 +426,8 @@ def list_ticks(
 def require_still(source: Source, ticks: Ticks) -> Ticks:
     """Return the ticks of a schedule whose variable stands still. Raises LogError: it moves."""
     assert isinstance(source, ScheduledController) and ticks.place is not None
-    low, high = float(np.nanmin(ticks.place)), float(np.nanmax(ticks.place))
-    if high - low > SAME_PLACE * (source.points[-1] - source.points[0]):
+    if not stands_still(ticks.place, source.points):
+        low, high = np.nanmin(ticks.place), np.nanmax(ticks.place)
         raise LogError(
             f"{ticks.source}: {source.over} moves from {low:.4g} to {high:.4g}{unit_after(source.unit)}, and the "
             "response is judged where it stands; hold it at a value"

@@ -21,7 +21,6 @@ from seaopt.errors import SeaoptError
 from seaopt.machine.gains.edited_table import Edit, list_edits
 from seaopt.machine.gains.free_gains import find_same, fit_gains, make_law, read_gains
 from seaopt.machine.stepped import (
-    SAME_PLACE,
     Match,
     Others,
     Setting,
@@ -36,6 +35,7 @@ from seaopt.machine.stepped import (
     make_setting,
     play,
     stand,
+    stands_still,
 )
 from seaopt.machine.ticks import Ticks
 from seaopt.records import record
@@ -144,13 +144,13 @@ def find_causes(whole: Setting, match: Match, others: Others) -> tuple[tuple[Cau
     if not before:
         return (), whole
     tried = sorted(_try_all(window, others), key=_rank)
-    if not tried or not tried[0][1].met or tried[0][0].kind in FITTED:
+    if not tried or not tried[0][1].explains or tried[0][0].kind in FITTED:
         size = min(len(whole.ticks), MOST_ROWS)
         begin = max(0, min(middle - size // 2, len(whole.ticks) - size))
         edited = _try_table(replace(whole, ticks=whole.ticks.take(slice(begin, begin + size))))
         if edited is not None:
             energy = float(np.mean(match.error[begin : begin + size] ** 2))
-            rest = [_make_cause(*pair, before) for pair in tried[: MOST_CAUSES - 1] if not pair[1].met]
+            rest = [_make_cause(*pair, before) for pair in tried[: MOST_CAUSES - 1] if not pair[1].explains]
             shown = [cause for cause in rest if cause.removes > 0.0]
             return (_make_cause(*edited, energy), *shown), edited[0].change(whole)
     if not tried or tried[0][1].energy >= before:
@@ -179,7 +179,7 @@ def _look_further(
     if much and (second := _find_behind(best, window, {})) is not None:
         return best, second
     gains = _try_gains(whole, window, energy, others)
-    if gains is not None and gains[1].met:
+    if gains is not None and gains[1].explains:
         return gains, None
     rivals = list[tuple[Tried, Tried]]()
     for first in [pair for pair in tried if pair[0].kind in ("late", "limit")]:
@@ -188,7 +188,7 @@ def _look_further(
         change = first[0].change
         behind = _find_behind(first, window, others) if first[0].kind == "late" else None
         behind = behind or _try_gains(change(whole), change(window), energy, others)
-        if behind is not None and behind[1].met:
+        if behind is not None and behind[1].explains:
             rivals.append((first, behind))
     if rivals:
         return min(rivals, key=lambda pair: _rank(pair[1]))
@@ -198,7 +198,7 @@ def _look_further(
 def _find_behind(first: Tried, window: Setting, others: Others) -> Tried | None:
     """Return the cause that explains what a first one leaves; None where none explains all of it."""
     second = min(_try_all(first[0].change(window), others), key=_rank, default=None)
-    return second if second is not None and second[1].met else None
+    return second if second is not None and second[1].explains else None
 
 
 def _try_gains(whole: Setting, window: Setting, energy: float, others: Others) -> Tried | None:
@@ -216,13 +216,13 @@ def _try_gains(whole: Setting, window: Setting, energy: float, others: Others) -
         exported=own.by_name(),
     )
     played = next(_play_each(window, [alternative]), None)
-    return played if played is not None and (played[1].met or played[1].energy < LESS * energy) else None
+    return played if played is not None and (played[1].explains or played[1].energy < LESS * energy) else None
 
 
 def _try_table(setting: Setting) -> Tried | None:
     """Return the edit of a schedule's table that explains the log, and its match; None where none does."""
     alternatives = (_make_edit(setting, edit) for edit in list_edits(setting))
-    return next((pair for pair in _play_each(setting, alternatives) if pair[1].met), None)
+    return next((pair for pair in _play_each(setting, alternatives) if pair[1].explains), None)
 
 
 def _make_edit(setting: Setting, edit: Edit) -> Alternative:
@@ -267,7 +267,8 @@ def _rank(pair: Tried) -> tuple[bool, bool, bool, float]:
     """
     alternative, match = pair
     fitted, unit = alternative.fitted or alternative.kind in FITTED, alternative.kind == "unit"
-    return not match.met, match.met and fitted, match.met and unit, match.energy
+    explains = match.explains
+    return not explains, explains and fitted, explains and unit, match.energy
 
 
 def _make_cause(alternative: Alternative, played: Match, before: float) -> Cause:
@@ -277,7 +278,7 @@ def _make_cause(alternative: Alternative, played: Match, before: float) -> Cause
         value=alternative.value,
         unit=alternative.unit,
         removes=1.0 - played.energy / before,
-        explains=played.met,
+        explains=played.explains,
         gains=alternative.gains,
         exported=alternative.exported,
         edited=alternative.edited,
@@ -295,7 +296,7 @@ def _play_each(setting: Setting, alternatives: Iterable[Alternative]) -> Iterato
         except SeaoptError:  # a law that cannot run so
             continue
         if np.isfinite(played.energy):
-            yield alternative, replace(played, allowed=0.0 * played.allowed) if played.coarse else played
+            yield alternative, played
 
 
 def list_alternatives(setting: Setting, others: Others) -> Iterator[Alternative]:
@@ -361,8 +362,9 @@ def _scale(what: str, factor: float, setting: Setting) -> Setting:
 
 def _list_factors(setting: Setting) -> Iterator[Alternative]:
     """Yield signs, units and other factors of reference, readings and command."""
-    fitted = _fit_factors(setting)
-    if isinstance(setting.law, RunnableSchedule) and setting.controller.command.input in fitted:
+    fitted, law, place = _fit_factors(setting), setting.law, setting.ticks.place
+    moves = isinstance(law, RunnableSchedule) and place is not None and not stands_still(place, law.table.points)
+    if moves and setting.controller.command.input in fitted:
         fitted |= _refine_command(setting, fitted[setting.controller.command.input])
     for what in (
         *(setting.ticks.rendered or ()),
@@ -504,10 +506,9 @@ def _list_places(setting: Setting) -> Iterator[Alternative]:
         change = _change_ticks(lambda rows, factor=factor: _scale_place(rows, factor))
         kind = "sign" if factor < 0.0 else "unit"
         yield Alternative(kind=kind, what=over, value=factor, change=change)
-
     if (shift := _fit_place(setting)) is not None:
         change = _change_ticks(lambda rows: _shift_place(rows, shift))
-        still = np.ptp(place) <= SAME_PLACE * (points[-1] - points[0])
+        still = stands_still(place, law.table.points)
         kind, value = ("place", float(np.median(place)) + shift) if still else ("shift", shift)
         yield Alternative(kind=kind, what=over, value=value, unit=law.table.unit, change=change, fitted=True)
 

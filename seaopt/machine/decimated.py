@@ -43,9 +43,10 @@ from seaopt.errors import LogError
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_parts, name_factor
 from seaopt.machine.gains.free_gains import read_gains
+from seaopt.machine.response.enclosed import take_given
 from seaopt.machine.response.periods import Blocks, cut_periods
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
-from seaopt.machine.stepped import SAME_PLACE, Others, Setting, keep_over, stand
+from seaopt.machine.stepped import Others, Setting, keep_over, stand, stands_still
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import record
 
@@ -327,12 +328,11 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
     if outer is not None and not outer.stiffness:
         return LineMatch(causes=(leave_open("outer", "loop"),))
     if outer is not None:
-        ticks = _take_given(ticks, controller.signals, outer)
+        ticks = take_given(ticks, outer.position, controller.signals)
     place, others = math.nan, keep_over(others, law.table.over if isinstance(law, RunnableSchedule) else None)
     if isinstance(law, RunnableSchedule):
         place = law.fallback if ticks.middle is None else ticks.middle
-        moved = 0.0 if ticks.place is None else float(np.ptp(ticks.place))
-        if moved > SAME_PLACE * np.ptp(law.table.points):
+        if ticks.place is not None and not stands_still(ticks.place, law.table.points):
             return LineMatch(causes=(leave_open("moving", law.table.over),))
     try:
         blocks = cut_periods(controller, ticks)
@@ -371,14 +371,6 @@ def _enclose(law: Law, signals: Sequence[str], outer: OuterLoop | None) -> Law:
     if outer is None:
         return law
     return enclose_law(law, outer, signals.index(outer.position) if outer.position in signals else None, of_force=True)
-
-
-def _take_given(ticks: Ticks, signals: Sequence[str], outer: OuterLoop) -> Ticks:
-    """Return ticks with what the outer loop was given as their reference, and the position among the readings."""
-    assert ticks.given is not None
-    given, position = ticks.given.T
-    measured = ticks.measured if outer.position in signals else np.column_stack([ticks.measured, position])
-    return replace(ticks, reference=given, measured=measured, rendered=None)
 
 
 def evaluate(law: Law, blocks: Blocks, ticks_per_row: int, image: int = 0) -> Complex[np.ndarray, "k m"]:

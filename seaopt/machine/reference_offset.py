@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from seaopt.control import RunnableLaw
 from seaopt.machine.response.periods import find_period
-from seaopt.machine.stepped import Match, Setting, find_at_limit, find_steady, list_steps
+from seaopt.machine.stepped import Match, Setting, find_at_limit, find_steady, list_steps, take_weights
 from seaopt.records import record
 
 SIGMAS = 4.0
@@ -58,8 +58,7 @@ def _weigh_rows(
     law: RunnableLaw, limited: Bool[np.ndarray, " n"], weights: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k"]:
     """Return what a weighted sum of a law's commands changes by with the reference, and with each reading, in a row."""
-    columns = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
-    direct = np.append(law.d_reference, -np.ravel(law.d_measurement))
+    columns, direct = take_weights(law)
     back = law.anti_windup[:, None]
     ways = (law.a, columns), (law.a - back * law.c, columns - back * direct)
     seen, later = np.empty((limited.size, direct.size)), np.zeros(law.c.size)

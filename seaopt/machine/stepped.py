@@ -20,7 +20,7 @@ integrals hold at the first of them, a polynomial, which is taken out of them fi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -103,6 +103,11 @@ def keep_over(others: Others, over: str | None) -> Others:
         for name, other in others.items()
         if not isinstance(other, ScheduledController) or other.over == over
     }
+
+
+def stands_still(place: Float[np.ndarray, " n"], points: Sequence[float] | Float[np.ndarray, " k"]) -> bool:
+    """Tell whether a schedule's variable moves so little that the schedule is one law. `points`: of the schedule."""
+    return float(np.nanmax(place) - np.nanmin(place)) <= SAME_PLACE * float(np.ptp(points))
 
 
 def make_setting(source: Source, ticks: Ticks) -> Setting:
@@ -209,6 +214,11 @@ class Match:
         """Whether rounding allows so much of the command that any law may be met."""
         logged = self.commands - self.error
         return math.sqrt(float(np.mean(self.allowed**2))) > COARSEST * float(np.std(logged))
+
+    @property
+    def explains(self) -> bool:
+        """Whether it is met, and not for a log that lets any law pass; a command that is the same is no such."""
+        return self.met and not (self.coarse and self.energy)
 
     @property
     def met(self) -> bool:
@@ -475,8 +485,7 @@ def _allow(
 
     n, integrals = len(ticks), count_integrals(law)
     response = find_modes(law, np.zeros(min(n, LONGEST_RESPONSE) - 1, dtype=bool))
-    columns = np.column_stack([law.b_reference, np.reshape(law.b_measurement, (law.c.size, -1))])
-    direct, seen = np.append(law.d_reference, law.d_measurement), np.column_stack([ticks.reference, ticks.measured])
+    (columns, direct), seen = take_weights(law), np.column_stack([ticks.reference, ticks.measured])
     variance = np.full(n, log.quantum**2 / 12.0 + (FLOOR * float(np.std(log.command))) ** 2)
     within = float(variance[0])
     for b, d, values, step in zip(columns.T, direct, seen.T, steps, strict=True):

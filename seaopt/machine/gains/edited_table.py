@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from seaopt.control import LawState, RunnableSchedule
 from seaopt.control.scheduling.runnable_schedule import make_runnable
 from seaopt.errors import SeaoptError
-from seaopt.machine.stepped import HEAD, SAME_PLACE, Setting, find_at_limit, find_modes, list_starts, run_setting
+from seaopt.machine.stepped import HEAD, Setting, find_at_limit, find_modes, list_starts, run_setting, stands_still
 from seaopt.records import record
 
 STEP = 0.01  # of a factor, by which a column is made
@@ -69,7 +69,7 @@ def list_edits(setting: Setting) -> Iterator[Edit]:
     law, place = setting.law, setting.ticks.place
     if not isinstance(law, RunnableSchedule) or place is None:
         return
-    if np.nanmax(place) - np.nanmin(place) <= SAME_PLACE * np.ptp(law.table.points):
+    if stands_still(place, law.table.points):
         return
     fit = _Fit.make(setting, law)
     columns = {

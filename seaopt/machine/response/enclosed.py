@@ -6,6 +6,7 @@ of the position in it. From there on the loop is one as any other, broken at the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -38,12 +39,21 @@ def enclose_ticks(enclosed: Controller, ticks: Ticks) -> Ticks:
     """Return the ticks of a force law as those of its law with the outer loop in it."""
     from scipy.signal import lfilter  # deferred: 0.3 s
 
-    assert ticks.given is not None
-    given, position = ticks.given.T
+    read = enclosed.signals if len(enclosed.signals) == ticks.measured.shape[1] else enclosed.signals[:-1]
     kept = keep_share(enclosed.signals[-1])
-    if kept < 1.0:  # a link that nothing holds, whose place drifts
-        position = np.asarray(lfilter([1.0, -1.0], [1.0, -kept], position - position[0]))
-    reads_it = len(enclosed.signals) == ticks.measured.shape[1]
-    measured = ticks.measured if reads_it else np.column_stack([ticks.measured, position])
-    beside = {name: part for name, part in ticks.beside.items() if name not in enclosed.signals}
+    if kept < 1.0 and ticks.given is not None:  # a link that nothing holds, whose place drifts
+        given, position = ticks.given.T
+        moved = np.asarray(lfilter([1.0, -1.0], [1.0, -kept], position - position[0]))
+        ticks = replace(ticks, given=np.column_stack([given, moved]))
+    return take_given(ticks, enclosed.signals[-1], read)
+
+
+def take_given(ticks: Ticks, position: str, signals: Sequence[str]) -> Ticks:
+    """Return ticks with what the outer loop was given as their reference, and its position among the readings, which
+    are those of the force law's signals.
+    """
+    assert ticks.given is not None
+    given, moved = ticks.given.T
+    measured = ticks.measured if position in signals else np.column_stack([ticks.measured, moved])
+    beside = {name: part for name, part in ticks.beside.items() if name not in (*signals, position)}
     return replace(ticks, reference=given, measured=measured, beside=beside, rendered=None, given=None)
