@@ -15,34 +15,14 @@ import seaopt as so
 from seaopt.cli.main import app
 from seaopt.control import Impedance, add_impedance, tune_schedule
 from seaopt.machine.design_run import run_design
+from tests.machine.conftest import KNEE
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_hidden import LINES as KNEE_LINES
 from tests.machine.test_hidden import SPEC as KNEE_SPEC
 from tests.machine.test_hidden import STATED
 
 T = 1e-3
-KNEE = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "k_s": 300.0}
 INERTIA, DAMPER = 0.5, 2.0  # of the link
-
-
-def make_knee(stiffness):
-    """Return a knee's law that renders an impedance at its link."""
-    knee = so.plants.rotary()
-    values = knee.complete(so.ParameterSet()).update(**KNEE)
-    spec = so.ControllerSpec(bandwidth_hz=20, measured="tau_s", current_limit_A=9.0, max_noise_gain=45)
-    law = so.tune(so.plants.rotary(link="locked"), values, spec)
-    asked = Impedance(stiffness=stiffness, damping=1.0, velocity_filter_s=0.005)
-    return add_impedance(law, knee, values, asked, name="knee")
-
-
-@pytest.fixture(scope="module")
-def impedance():
-    return make_knee(20.0)
-
-
-@pytest.fixture(scope="module")
-def damping():
-    return make_knee(0.0)
 
 
 def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1, dry=0.0):

@@ -11,18 +11,9 @@ import pytest
 import seaopt as so
 from seaopt.formatting import format_number
 from seaopt.machine.bringup.files import write_bring_up
+from tests.machine.conftest import KNEE
 from tests.machine.test_bringup import MAIN
-from tests.machine.test_outer_loop import KNEE, Quiet, make_knee, make_log, run, take_link
-
-
-@pytest.fixture(scope="module")
-def impedance():
-    return make_knee(20.0)
-
-
-@pytest.fixture(scope="module")
-def damping():
-    return make_knee(0.0)
+from tests.machine.test_outer_loop import Quiet, make_log, run, take_link
 
 
 def plan_outer(law, link, **limits):
