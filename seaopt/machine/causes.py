@@ -19,7 +19,7 @@ from seaopt.control import ForceMPC, RunnableSchedule, ScheduledController
 from seaopt.control.laws.structures import Gains
 from seaopt.errors import SeaoptError
 from seaopt.machine.gains.edited_table import Edit, list_edits
-from seaopt.machine.gains.free_gains import find_same, fit_gains, make_law, read_gains
+from seaopt.machine.gains.free_gains import find_same, fit_gains, make_law
 from seaopt.machine.stepped import (
     Match,
     Others,
@@ -205,7 +205,7 @@ def _try_gains(whole: Setting, window: Setting, energy: float, others: Others) -
     """Return the law with another set of gains, all fitted at once, and its match, where it leaves much less of the
     mismatch than any single cause.
     """
-    own, gains = read_gains(whole.controller), fit_gains(whole)
+    own, gains = whole.controller.read_gains(), fit_gains(whole)
     if own is None or gains is None:
         return None
     alternative = Alternative(
@@ -553,7 +553,7 @@ def _scale_place(ticks: Ticks, factor: float) -> Ticks:
 
 def _list_of_gains(setting: Setting) -> Iterator[Alternative]:
     """Yield laws with parts that are left out, with gains of another size, and made for another rate."""
-    controller, gains = setting.controller, read_gains(setting.controller)
+    controller, gains = setting.controller, setting.controller.read_gains()
     if gains is None:
         return
     for kind, what, value, part in list_parts(gains):

@@ -42,7 +42,6 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import LogError
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_parts, name_factor
-from seaopt.machine.gains.free_gains import read_gains
 from seaopt.machine.response.enclosed import take_given
 from seaopt.machine.response.periods import Blocks, cut_periods
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
@@ -265,7 +264,7 @@ class Table:
                 stood = other.table.law(place) if isinstance(other, ScheduledController) else first.law
                 yield Shift(kind="another law", what=name, commands=self.differ(stood))
         yield from self._list_outer()
-        gains = read_gains(controller)
+        gains = controller.read_gains()
         if gains is not None:
             yield from self._list_gains(gains)
 

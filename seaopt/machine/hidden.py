@@ -34,7 +34,7 @@ from jaxtyping import Complex, Float
 from seaopt.control import RunnableLaw
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.machine.causes import Alternative, Cause, list_others, list_parts
-from seaopt.machine.gains.free_gains import make_law, read_gains
+from seaopt.machine.gains.free_gains import make_law
 from seaopt.machine.response.periods import find_period
 from seaopt.machine.stepped import (
     FLOOR,
@@ -167,7 +167,7 @@ def _list_hidden(setting: Setting, others: Others) -> Iterator[tuple[Alternative
     """Yield other laws, and of those with a gain of another size that gain."""
     for alternative in list_others(setting, others):
         yield alternative, None
-    controller, gains = setting.controller, read_gains(setting.controller)
+    controller, gains = setting.controller, setting.controller.read_gains()
     if gains is None:
         return
     for kind, what, value, part in list_parts(gains):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.machine.gains.free_gains import make_law, read_gains
+from seaopt.machine.gains.free_gains import make_law
 from seaopt.machine.hidden import Segments, find_hidden, respond
 from seaopt.machine.stepped import make_setting, play
 from seaopt.machine.ticks import take_ticks
@@ -38,7 +38,7 @@ def knee():
 def benches(compiler, tmp_path_factory, knee):
     """Return those of the law, of it without its observer, and of it with a k_p that is 0.3 % smaller."""
     law, folder = knee[0], tmp_path_factory.mktemp("knee")
-    gains, spec = read_gains(law), replace(SPEC, structure="custom")
+    gains, spec = law.read_gains(), replace(SPEC, structure="custom")
 
     def make(name, **changes):
         made = replace(gains, **changes).law("pid_dob", 1e-3).balanced()
@@ -81,7 +81,7 @@ def test_a_missing_observer_is_told_below_the_rounding_of_every_tick(knee, bench
 def test_shares_are_as_the_rounding_of_a_right_law_scatters_them(knee, benches):
     """That of the observer, in logs whose rounding is drawn anew: zero, with the std that is stated."""
     law, machine = knee
-    bare = make_law(law, replace(read_gains(law), observer=None))
+    bare = make_law(law, replace(law.read_gains(), observer=None))
     scores = []
     for seed in range(12):
         ticks = take_ticks(law, record(benches["law"], machine, seed))
@@ -96,7 +96,7 @@ def test_shares_are_as_the_rounding_of_a_right_law_scatters_them(knee, benches):
 def test_the_rounding_of_a_reference_that_repeats_is_the_same_each_time(knee, benches):
     """Twenty times the same errors are no twenty times as many: such shares were said to stand out by 6 to 10 std."""
     law, machine = knee
-    bare = make_law(law, replace(read_gains(law), observer=None))
+    bare = make_law(law, replace(law.read_gains(), observer=None))
     scores = []
     for seed in range(8):
         periodic = multisine(1000, LINES, 20, 1.0, seed)

@@ -22,7 +22,6 @@ from seaopt.control.laws.structures import Gains
 from seaopt.control.running.law_step import run_law
 from seaopt.formatting import format_number
 from seaopt.machine.design_run import run_design
-from seaopt.machine.gains.free_gains import read_gains
 from seaopt.machine.stepped import Setting, limit_law
 from seaopt.machine.ticks import Ticks
 from seaopt.machine.wording import say_cause
@@ -326,7 +325,7 @@ def test_a_cascade_is_replayed_and_another_set_of_its_gains_is_named():
 
     (row,) = so.accept(law, [play(law)]).replays
     assert row.met and row.command_late == 0 and row.mismatch < 1e-9
-    gains = read_gains(law)
+    gains = law.read_gains()
     other = replace(
         gains, k_p=0.7 * gains.k_p, k_i=1.3 * gains.k_i, inner=replace(gains.inner, k_v=0.8 * gains.inner.k_v)
     )

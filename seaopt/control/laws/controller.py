@@ -215,7 +215,7 @@ class Controller(ClosesLoops, Result, Worded):
 
         Filter and integral are those of the gains where they make the law; of another law they are read off the law.
         """
-        gains, ts = self._read_gains(), self.sample_time_s
+        gains, ts = self.read_gains(), self.sample_time_s
         filter_samples, integral = count_filter_samples(self.law), find_integral_rate(self.law)
         if gains is not None and gains.makes(self.law, self.spec.structure):
             filter_samples = gains.T_f / ts if gains.k_d else np.inf
@@ -242,10 +242,10 @@ class Controller(ClosesLoops, Result, Worded):
     @property
     def prefilter(self) -> Prefilter | None:
         """The low-pass of the reference, with its numbers; None without one."""
-        gains = self._read_gains()
+        gains = self.read_gains()
         return None if gains is None else gains.prefilter
 
-    def _read_gains(self) -> Gains | None:
+    def read_gains(self) -> Gains | None:
         """Return the gains with what else the law is made of; None of a custom law."""
         if not set(LAW_GAINS) <= set(self.gains):
             return None
@@ -257,7 +257,7 @@ class Controller(ClosesLoops, Result, Worded):
 
         None without a prefilter, of a loop that never falls to -3 dB, and of a measured design plant.
         """
-        gains = self._read_gains()
+        gains = self.read_gains()
         if gains is None or gains.prefilter is None or self.design is None:
             return None
         law = replace(gains, prefilter=None).law(self.spec.structure, self.sample_time_s)

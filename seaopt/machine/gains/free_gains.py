@@ -40,13 +40,6 @@ STEP = 1e-6  # of a logarithm, by which the search differentiates
 SAME_GAINS = 0.01  # relative: gains that are those of another law
 
 
-def read_gains(controller: Controller) -> Gains | None:
-    """Return the gains that make a controller's law; None of a law of the user's own."""
-    if not set(LAW_GAINS) <= set(controller.gains):
-        return None
-    return Gains.from_names(controller.gains, controller.observer, controller.speed_loop, controller.link)
-
-
 def make_law(
     controller: Controller, gains: Gains, sample_time_s: float | None = None, *, balanced: bool = True
 ) -> Callable[[Setting], Setting]:
@@ -103,7 +96,7 @@ def fit_gains(setting: Setting) -> Gains | None:
     """
     from scipy.optimize import least_squares  # deferred: 0.1 s
 
-    own, rows = read_gains(setting.controller), _find_free(setting)
+    own, rows = setting.controller.read_gains(), _find_free(setting)
     if own is None or not isinstance(setting.law, RunnableLaw) or not rows:
         return None
     runs = [_Run(commands=ticks.command, inputs=Inputs.make(setting.linear, ticks)) for ticks in rows]

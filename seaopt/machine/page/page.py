@@ -11,7 +11,6 @@ from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.size_fit import Difference
-from seaopt.machine.gains.free_gains import read_gains
 from seaopt.machine.page.figures import list_panels
 from seaopt.machine.page.verdict import OUTCOMES, judge, name_figure, say_inside, say_undecided, show_interval
 from seaopt.machine.reference_offset import Offset
@@ -310,7 +309,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     remarks += tuple(
         f"A log has one row for {each} ticks: it is compared at the lines of the reference." for each in rows_of
     )
-    if rows_of and read_gains(result.controller) is None:
+    if rows_of and result.controller.read_gains() is None:
         remarks += (NO_GAINS,)
     if result.replayed:
         remarks += (_say_reach(result),)
