@@ -43,6 +43,14 @@ def median(values: VectorN) -> float:
     return upper if values.size % 2 else 0.5 * (float(np.max(ordered[:middle])) + upper)
 
 
+def measure_white(values: VectorN) -> float:
+    """Return the std of white noise on a smooth signal: by third differences, which motions hardly have. Zero of fewer
+    than four values.
+    """
+    third = np.abs(np.diff(values, 3))
+    return 1.4826 * median(third) / np.sqrt(20.0) if third.size else 0.0
+
+
 @record
 class Origin:
     """Where a channel came from."""

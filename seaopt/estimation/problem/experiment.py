@@ -24,6 +24,7 @@ from seaopt.plants import Plant
 from seaopt.plants.plant import follow_readings
 from seaopt.plants.sensors.difference import Difference, add_difference, find_state
 from seaopt.records import record
+from seaopt.signals import measure_white
 from seaopt.simulation import Hold, Segment
 from seaopt.simulation.simulate import input_samples
 from seaopt.units import factor, same_dimension
@@ -225,9 +226,7 @@ class Experiment:
         if not self.reads(state) or is_constant(self.log[state]):
             return 0.0
         values = self.log[state][np.isfinite(self.log[state])]
-        # of white noise; motion is slower
-        third = 1.4826 * float(np.median(np.abs(np.diff(values, 3)))) / np.sqrt(20.0)
-        return ROUGH / max(third, find_quantisation(values) / np.sqrt(12.0), 1e-300)
+        return ROUGH / max(measure_white(values), find_quantisation(values) / np.sqrt(12.0), 1e-300)
 
     def read(self, state: str) -> Signal:
         """Return what a sensor has read of a state, without the gain and the offset that are known of it; a line where

@@ -19,6 +19,7 @@ from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.solver.least_squares import Callback, minimise
 from seaopt.estimation.solver.settle import FLAT, estimate_sigma
 from seaopt.estimation.solver.step_size import EXACT, bound_steps
+from seaopt.signals import measure_white
 from seaopt.simulation import Point, Segment, run_passes
 
 PREDICTION_RADIUS = 100.0  # a plant that is held to the log may be moved far at once
@@ -71,13 +72,10 @@ def add_predictors(problem: FitProblem, z: Vector, *, follows: bool) -> FitProbl
 
 
 def _estimate_noise(experiment: FitExperiment) -> PerOutput:
-    """Return the standard deviation of white noise on each output, from its first samples that are not held out. On a
-    smooth signal that is the median third difference, over sqrt(20).
-    """
+    """Return the standard deviation of white noise on each output, from its first samples that are not held out."""
     used, noise = experiment.segments[0].mark_counted(0, slice(0, FIRST_SAMPLES)), list[float]()
     for o, channel in enumerate(experiment.segments[0].samples.y):
-        third = np.abs(np.diff(channel[:FIRST_SAMPLES][used[:, o]], 3))
-        noise.append(1.4826 * float(np.median(third)) / np.sqrt(20.0) if third.size else 0.0)
+        noise.append(measure_white(channel[:FIRST_SAMPLES][used[:, o]]))
     return np.maximum(noise, np.maximum(EXACT * experiment.spread, 1e-300))
 
 

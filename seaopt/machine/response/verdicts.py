@@ -49,6 +49,7 @@ from seaopt.machine.response.reach import Band, find_missing, find_reach
 from seaopt.machine.ticks import Ticks
 from seaopt.plants.friction import find_dry_friction, split_friction
 from seaopt.records import record
+from seaopt.signals import measure_white
 
 LEAST_PHASES = 6  # sets of phases, with dry friction
 SAME_GAIN = 0.1  # relative, between two amplitudes
@@ -142,12 +143,9 @@ def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
 
 
 def find_noise_share(controller: Controller, ticks: Ticks) -> float:
-    """Return the share of the command's rms that the noise of what is read makes, taken as white: from third
-    differences of the readings, which motions hardly have.
-    """
+    """Return the share of the command's rms that the noise of what is read makes, taken as white."""
     f = np.linspace(0.0, 0.5 / controller.sample_time_s, GRID + 2)[1:-1]
-    third = np.diff(ticks.measured, 3, axis=0)
-    std = 1.4826 * np.nanmedian(np.abs(third), axis=0) / np.sqrt(20.0)
+    std = np.array([measure_white(reading[np.isfinite(reading)]) for reading in ticks.measured.T])
     power = np.mean(np.abs(controller.law.responses(f)[1:]) ** 2, axis=1)
     noise = abs(controller.per_effort) * float(np.sqrt(std**2 @ power))
     return noise / max(float(np.nanstd(ticks.command)), 1e-300)
