@@ -66,7 +66,7 @@ class MeasuredResponse:
     confidence : float
         Between 0 and 1.
     averages : array, shape (m,)
-        Segments averaged: many short ones where the response is smooth, few long ones where it is not.
+        Windows averaged: many short ones where the response is smooth, few long ones where it is not.
     further : tuple of MeasuredResponse
         Of the same log, of the other outputs that a law reads; their discs and these hold the truth together.
     values : mapping of name to float

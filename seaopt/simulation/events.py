@@ -139,10 +139,8 @@ class _Steps:
                 )
                 before, after = slopes
                 share = find_turn(mode * first.speed, before, mode * last.speed, after)
-            z, elapsed = (
-                self._advance(z, elapsed, elapsed + share * (1.0 - elapsed), mode),
-                elapsed + share * (1.0 - elapsed),
-            )
+            turn = elapsed + share * (1.0 - elapsed)
+            z, elapsed = self._advance(z, elapsed, turn, mode), turn
             now = self._look(z, elapsed)
             following = now.choose_mode() if mode else float(np.sign(now.holding))
             if mode * following < 0.0:

@@ -96,9 +96,7 @@ class MeasuredPlant:
     @property
     def band_hz(self) -> tuple[float, float]:
         """Where all outputs were measured."""
-        ends = zip(*((output.f[0], output.f[-1]) for output in self.outputs), strict=True)
-        lows, highs = ends
-        return float(max(lows)), float(min(highs))
+        return float(max(each.f[0] for each in self.outputs)), float(min(each.f[-1] for each in self.outputs))
 
     @property
     def nyquist_hz(self) -> float:
