@@ -221,37 +221,25 @@ def _excite(
         run = _run_terms(controller, runs, _scale(excitation, per_given))
         return excitation, run, None if run is None or not dry else _measure_swing(controller, excitation, run)
 
+    def find_peaks(excitation: Excitation, run: LoopRun | None) -> dict[str, float]:
+        peaks = _add_noise(controller, runs, _scale(excitation, per_given), options["sensors"])
+        return peaks if run is None else _take_larger(peaks, {**run.outputs, command: run.current})
+
+    limit, command = controller.command_limit, controller.command.input
     excitation, run, effort = play(share)
     for _ in range(RAISES):
         if effort is None or effort >= MOVES * friction or share >= most:
             break
         share = min(share * max(MOVES * friction / max(effort, 1e-12), ONWARD), most)
         excitation, run, effort = play(share)
-    peaks = _find_peaks(controller, runs, excitation, run, per_given, options["sensors"])
-    limit, command = controller.command_limit, controller.command.input
+    peaks = find_peaks(excitation, run)
     for _ in range(LOWERS):  # a period in which the command is at its limit is lost for the response
         if limit is None or peaks[command] < ROOM * limit:
             break
         share *= LESS
         excitation, run, effort = play(share)
-        peaks = _find_peaks(controller, runs, excitation, run, per_given, options["sensors"])
+        peaks = find_peaks(excitation, run)
     return replace(excitation, peaks=peaks), effort, friction if dry else None
-
-
-def _find_peaks(
-    controller: Controller,
-    runs: Controller,
-    excitation: Excitation,
-    run: LoopRun | None,
-    per_given: float,
-    sensors: Sensors | None,
-) -> dict[str, float]:
-    """Return the peaks of a reference and of its run, with the noise of what is read."""
-    peaks = _add_noise(controller, runs, _scale(excitation, per_given), sensors)
-    if run is None:
-        return peaks
-    signals = {**run.outputs, controller.command.input: run.current}
-    return {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
 
 
 def _scale(excitation: Excitation, per_given: float) -> Excitation:
@@ -298,8 +286,13 @@ def _add_noise(
         rng = np.random.default_rng((SEED, seed))
         for name, (std, step) in errors.items():
             signals[name] = np.abs(signals[name] + std * rng.normal(size=signals[name].shape)) + 0.5 * step
-        peaks = {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+        peaks = _take_larger(peaks, signals)
     return peaks
+
+
+def _take_larger(peaks: Mapping[str, float], signals: Mapping[str, Any]) -> dict[str, float]:
+    """Return peaks, or those of signals where they are larger."""
+    return {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
 
 
 def _band(at: Float[np.ndarray, " m"], rows: Any) -> Band:
