@@ -41,11 +41,13 @@ def find_silent(fit: Fit, freed: Freed | None = None) -> tuple[SilentEffect, ...
     try:
         if freed is None or not freed.additions:
             additions = tuple(list_additions(minimum.problem, minimum.z))
+            if not additions:
+                return ()
             freed = Freed.make(minimum.problem, minimum.z, additions=additions)
-        evaluation = freed.problem.evaluate(freed.z) if freed.additions else None
+        evaluation = freed.problem.evaluate(freed.z)
     except SeaoptError:  # what does not make a problem tells nothing
         return ()
-    if evaluation is None or not np.all(np.isfinite(evaluation.hessian)):
+    if not np.all(np.isfinite(evaluation.hessian)):
         return ()
     return tuple(_find_ties(fit, minimum.problem, freed, evaluation))
 
