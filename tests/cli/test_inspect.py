@@ -14,6 +14,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND
 from seaopt.cli.inspect import inspect_log
 from seaopt.errors import SeaoptError
+from seaopt.problem.proposal.survey import survey_log
 from tests.actuator_logs import write_csv
 
 
@@ -183,6 +184,15 @@ def test_the_command_to_type_has_the_unit_of_the_column_s_name(tmp_path, header)
     assert (column, unit) == (header.split(",")[1], "time=ms")
     inspect_log(path, time=column, units=[unit], folder=tmp_path)
     assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == 1000.0
+
+
+def test_a_clock_that_new_takes_is_taken(tmp_path, capsys):
+    path, t = tmp_path / "log.csv", 0.002 * np.arange(400)
+    rows = zip(5000.0 + 1e3 * t, 1e3 * np.sin(15.0 * t), 3.0 * np.sin(15.0 * t - 0.2), strict=True)
+    path.write_text("\n".join(["uptime_ms,cur_mA,tau_Nm", *(f"{a:.0f},{b:.1f},{c:.3f}" for a, b, c in rows)]))
+    assert survey_log(path).clock.name == "uptime_ms"
+    inspect_log(path)
+    assert "500 Hz" in capsys.readouterr().out
 
 
 def test_a_temperature_called_t_is_not_the_clock(tmp_path):

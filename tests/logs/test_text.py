@@ -227,6 +227,15 @@ def test_a_counter_named_clock_is_the_time_where_nothing_else_is(tmp_path, heade
     assert so.read_log(path, channels={"F1": "F1 [N]"}).rate_hz == pytest.approx(rate_hz)
 
 
+@pytest.mark.parametrize("header", ["uptime_ms", "elapsed_ms", "uptime [ms]", "millis [ms]"])
+def test_the_time_since_a_board_was_switched_on_is_the_time_where_nothing_else_is(tmp_path, header):
+    path, ticks = tmp_path / "log.csv", range(200)
+    path.write_text("\n".join([f"{header},F1 [N]", *(f"{5000 + 2 * k},{np.sin(k)}" for k in ticks)]))
+    assert so.read_log(path, channels={"F1": "F1 [N]"}).rate_hz == pytest.approx(500)
+    path.write_text("\n".join([f"{header},F1 [N],time [s]", *(f"{5000 + 2 * k},{np.sin(k)},{k}" for k in ticks)]))
+    assert so.read_log(path, channels={"F1": "F1 [N]"}).rate_hz == pytest.approx(1)
+
+
 def test_columns_named_like_a_time_and_columns_that_wrap():
     assert [is_time_name(name) for name in ("Zeit [ms]", "stamp [ms]", "imu.t", "F1 [N]")] == [True, True, True, False]
     assert suspect_wrap(np.array([0.0, 3.0, 65530.0, 65535.0, 1.0]), 0.0, 65535.0) == 16

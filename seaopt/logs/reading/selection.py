@@ -22,7 +22,8 @@ from seaopt.records import record
 from seaopt.signals import check_distinct
 from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
-COUNTERS = ("clock", "stamp")  # names of a time where nothing else has one, and of ticks beside it
+# Names of a time where nothing else has one, and of ticks beside it.
+COUNTERS = ("clock", "stamp", "uptime", "elapsed", "millis", "micros")
 _TIME_ENDING = re.compile(r"[_ ](s|ms|us|ns)$")
 MAX_NAMES = 20  # in a message
 HOW_TO_ALIGN = "align it by Hold(), Linear(), Nearest(tolerance_s=...) or Readings()"

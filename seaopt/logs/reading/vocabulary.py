@@ -18,7 +18,10 @@ Quantity = Literal["time", "current", "voltage", "duty", "force", "torque", "ang
 Side = Literal["motor", "link", "spring", ""]
 
 QUANTITY_WORDS: dict[Quantity, frozenset[str]] = {
-    "time": frozenset({"time", "t", "timestamp", "timestamps", "zeit", "tout", "stamp", "clock", "sekunden"}),
+    "time": frozenset({
+        "time", "t", "timestamp", "timestamps", "zeit", "tout", "stamp", "clock", "sekunden", "uptime", "elapsed",
+        "millis", "micros",
+    }),
     "current": frozenset({"i", "iq", "cur", "curr", "current", "amps", "ampere", "amperes", "strom", "imot", "im"}),
     "voltage": frozenset({"u", "uq", "vq", "volt", "volts", "voltage", "spannung"}),
     "duty": frozenset({"duty", "dutycycle", "pwm", "tastgrad"}),
