@@ -56,7 +56,7 @@ from seaopt.reporting import write_frontier_figure, write_report
 from seaopt.reporting.responses import estimate_responses
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands, Step, Verdict
-from seaopt.reporting.sections.verdict import UNMET, doubt_design, judge_expectations, name_guesses
+from seaopt.reporting.sections.verdict import UNMET, doubt_design, judge_expectations, judge_joint, name_guesses
 from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
 from seaopt.testing.expectations import list_expectations
@@ -541,7 +541,7 @@ class Session:
         if stage == "tune":
             joint = self.results.get("joint")
             if joint is not None:
-                verdicts.append(Verdict(met=joint.status == "certified", text=f"Joint tuning: {joint.summary}"))
+                verdicts.append(judge_joint(joint, certified="certify" in self.results))
             result = result if self.problem.mpc is None else self.plan()
         again = self.spell("run" if self.problem.table.experiment else "tune")
         recipes = {

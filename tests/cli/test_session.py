@@ -190,6 +190,17 @@ def test_one_controller_answers_new_questions_and_no_others(write, tmp_path, cap
         Session(write(text.replace("max_sensitivity = 1.6", "max_sensitivity = 1.5")), folder).run("certify")
 
 
+def test_a_law_that_no_round_certifies_has_the_reason_beside_it(write, tmp_path, capsys):
+    text = DESIGN[: DESIGN.index("[[experiment]]")] + DESIGN[DESIGN.index("[controller]") :]
+    text = text.replace("[0.3, 0.5]", "[0.02, 2.0]").replace("samples = 60", "samples = 20\nretune = 1")
+    session = Session(write(text), tmp_path / "out")
+    session.run("tune")
+    session.show(False, ["tune"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.startswith("not met Joint tuning: NOT certified (rounds, 1 round)")
+    assert "1 round was too few: " in told[: told.index("met Controller")]
+
+
 @pytest.fixture(scope="module")
 def tuned_once(tmp_path_factory):
     """Return a problem's text without experiments, and the folder of its controller, which ranges shaped."""

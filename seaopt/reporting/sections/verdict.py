@@ -9,7 +9,7 @@ from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.estimation import Fit
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Reason, Section, Table, Verdict, mark_met
-from seaopt.robustness import Certificate
+from seaopt.robustness import Certificate, JointTuning
 from seaopt.robustness.verification.verification import Verification
 
 UNMET = "on a fit that is not met"
@@ -51,6 +51,15 @@ def judge_results(
 def name_guesses(verdict: Verdict, guesses: str) -> Verdict:
     """Return the verdict with the guesses that it rests on ("on 2 guesses: N_p, l"), where it is met."""
     return replace(verdict, text=f"{verdict.text}, {guesses}") if verdict.met and guesses else verdict
+
+
+def judge_joint(joint: JointTuning, *, certified: bool) -> Verdict:
+    """Return the verdict on rounds of tuning and certifying. Of limits that no law meets, and where the law is
+    `certified` besides, the verdict that follows has the reasons.
+    """
+    said = joint.met or joint.certificate is None or certified
+    reasons = () if said else (Reason(what=joint.explanation),)
+    return Verdict(met=joint.met, text=f"Joint tuning: {joint.summary}", reasons=reasons)
 
 
 def doubt_design(verdict: Verdict) -> Verdict:

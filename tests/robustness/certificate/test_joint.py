@@ -121,7 +121,7 @@ def test_what_cannot_be_had_names_witness_limit_and_bandwidth(stand, swing, thor
 def test_too_few_rounds_are_no_certificate(stand, swing, thor):
     done = tune_certified(stand, thor, SPEC, {"swing": swing}, ranges=RANGES, samples=50, rounds=1)
     assert (done.status, done.certificate.passed) == ("rounds", False)
-    assert "1 rounds were too few" in done.explanation
+    assert "1 round was too few" in done.explanation
 
 
 def test_a_reserve_that_was_asked_is_kept_in_every_round(stand, swing, thor):

@@ -121,7 +121,8 @@ class JointTuning(Result):
         broken = next(row for row in self.certificate.requirements if not row.met)
         if self.status == "rounds":
             more = "" if self.certificate.fails_by_weight else "; give more rounds, or a larger reserve"
-            return f"{len(self.rounds)} rounds were too few: {broken}{more}"
+            few = "1 round was" if len(self.rounds) == 1 else f"{len(self.rounds)} rounds were"
+            return f"{few} too few: {broken}{more}"
         if self.status == "terms":
             more = "what is compensated takes more of a limit than a reserve of"
             remedy = "" if self.relief else "compensate less"
