@@ -18,6 +18,7 @@ from seaopt.records import record
 UNTOLD = 5.4
 MODE_COST = 2.0  # by which a mode, of several sizes, has to leave less than another cause does
 RATE_COST = 2.0  # by which a usual rate may leave more than another cause does
+SLIGHT = 1.5e-8  # of a size, for slopes
 
 
 @record
@@ -103,6 +104,7 @@ class SizeFit:
 
         k, leeway, measured = len(start), self.leeway, self.comparison.response
         std = self.comparison.std / math.sqrt(2.0)
+        prior = np.eye(leeway.std.size, k + leeway.std.size, k) / leeway.std[:, None]
 
         def respond(x: Float[np.ndarray, " n"]) -> Lines:
             return make(x[:k]) * np.exp(x[k:] @ leeway.directions)
@@ -111,6 +113,14 @@ class SizeFit:
             off = (measured - respond(x)) / std
             return np.concatenate([off.real, off.imag, x[k:] / leeway.std])
 
+        def differentiate(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "r n"]:
+            beside = np.exp(x[k:] @ leeway.directions)
+            response = (made := make(x[:k])) * beside
+            steps = SLIGHT * np.maximum(1.0, np.abs(x[:k]))
+            ways = [(make(x[:k] + each) - made) / np.max(each) * beside for each in np.diag(steps)]
+            off = -np.array([*ways, *(response * leeway.directions)]).T / std[:, None]
+            return np.vstack([off.real, off.imag, prior])
+
         first = np.array([*start, *(0.5 * (leeway.low + leeway.high))])  # at an edge the search would stay
         if not first.size:
             left = 0.5 * float(np.sum(errors(first) ** 2))
@@ -118,7 +128,8 @@ class SizeFit:
         low, high = np.reshape(ends or [(-math.inf, math.inf)] * k, (k, 2)).T
         edges = [np.concatenate([low, leeway.low]), np.concatenate([high, leeway.high])]
         scale = np.concatenate([np.maximum(np.abs(start), 1e-3), leeway.std])
-        solved = least_squares(errors, first, x_scale=scale, bounds=edges, max_nfev=200)
+        solve: Any = least_squares  # whose types know no function of slopes
+        solved = solve(errors, first, differentiate, x_scale=scale, bounds=edges, max_nfev=200)
         left, covariance = float(solved.cost), np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True)[:k, :k]
         covariance = covariance * max(left / measured.size, 1.0) * self.comparison.widening**2
         return Best(sizes=solved.x[:k], covariance=covariance, left=left, response=respond(solved.x))
