@@ -308,6 +308,7 @@ def _take_output(experiment: Experiment, output: str) -> Experiment:
         name=f"{experiment.name}-{output}",
         outputs=(output,),
         sigma=pick(experiment.sigma),
+        quantisation=pick(experiment.quantisation),
         gain=pick(experiment.gain),
         saturation=pick(experiment.saturation),
         offset=pick(experiment.offset) if isinstance(experiment.offset, Mapping) else experiment.offset,
@@ -348,6 +349,7 @@ def _swap_channels(experiments: tuple[Experiment, ...], params: ParameterSet, *,
                 e,
                 {channel: e.log[other], other: e.log[channel]},
                 sigma={name: value for name, value in e.sigma.items() if name not in pair},
+                quantisation={name: step for name, step in e.quantisation.items() if name not in pair},
             )
             for e in experiments
         )

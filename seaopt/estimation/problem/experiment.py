@@ -18,7 +18,7 @@ from seaopt.logs import Log
 from seaopt.logs.log.saturation import mask_saturated
 from seaopt.logs.quality.channel import BEYOND
 from seaopt.logs.quality.clock import split_rows
-from seaopt.logs.quality.faults import find_quantisation, find_runs
+from seaopt.logs.quality.faults import find_quantisation, find_runs, has_step
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import follow_readings
@@ -27,7 +27,7 @@ from seaopt.records import record
 from seaopt.signals import measure_white
 from seaopt.simulation import Hold, Segment
 from seaopt.simulation.simulate import input_samples
-from seaopt.units import factor, same_dimension
+from seaopt.units import factor, same_dimension, unit_after
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 MAX_DRIFT = 5
@@ -35,7 +35,6 @@ SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
 BRIDGED = 4  # missing samples in a row, that a line stands in for
 FEWEST_READ = 16  # samples that tell a reading's noise
-WHOLE = 0.02  # of a step, by which steps may be off that a log shows
 ROUGH = 0.3  # rad of a wave, that takes 4 % of it
 Mask = Literal["auto", "declared", "none"]
 # The values of a setting, and how to name them.
@@ -352,18 +351,27 @@ class Experiment:
             if not 0.0 < value < np.inf:
                 raise self._refuse(f"sigma of {name} = {value:g} is not positive; leave it out to estimate it")
         for name, step in self.quantisation.items():
-            shown = find_quantisation(self.log[name])
-            if not (
-                0.0 < step < np.inf and round(shown / step) >= 1 and abs(shown / step - round(shown / step)) < WHOLE
-            ):
-                raise self._refuse(
-                    f"quantisation of {name} = {step:g}, but its readings are not whole steps of that apart"
-                    + (f", they are {shown:.6g}" if shown else "")
-                    + "; correct it, or leave it out of a log that was filtered or resampled"
-                )
+            if not 0.0 < step < np.inf or not has_step(self.log[name], step):
+                raise self._refuse(self._describe_step(name, step))
         for name, ends in self.saturation.items():
             if not isinstance(ends, tuple | list) or len(ends) != 2 or not ends[0] < ends[1]:
                 raise self._refuse(f"saturation of {name} = {ends} is not a range; give [low, high]")
+
+    def _describe_step(self, name: str, step: float) -> str:
+        """Return that an output's readings have another step than the one that is stated, or none."""
+        unit, shown = unit_after(self.plant.outputs[name]), find_quantisation(self.log[name])
+        stated = f"quantisation of {name} = {step:.6g}{unit}"
+        if not shown:
+            return (
+                f"{stated}, but the channel's readings are not whole steps of any size apart, as of a log that was "
+                "filtered, resampled, or written with more digits than the sensor has; log what the sensor read, or "
+                "leave quantisation out"
+            )
+        finer = " (the log has finer digits than the sensor that is stated)" if shown < step else ""
+        return (
+            f"{stated}, but the channel's readings are {shown:.6g}{unit} apart{finer}; write quantisation = "
+            f"{{ {name} = {shown:.6g} }}, or leave it out"
+        )
 
     def _mask(self) -> None:
         """Make saturated samples missing in the experiment's own log."""

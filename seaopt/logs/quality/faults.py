@@ -27,6 +27,7 @@ REGULAR = 0.8  # share of a counter's, or a held channel's, steps that must be a
 LARGEST_COUNT = 2.0**53  # below which a float is every whole number
 FEW_APART = 2_000  # distances that are enough to see that half of them are no multiples of a step
 FEWEST_SAMPLES = 16  # samples below which nothing is judged
+WHOLE = 0.02  # of a step, by which one that is stated may differ from what a channel shows
 
 
 @record(eq=False)
@@ -96,13 +97,8 @@ def measure_stillness(values: VectorN) -> float:
 
 def find_quantisation(values: VectorN) -> float:
     """Return the step whose multiples the samples are; 0 where there is none."""
-    stride = max(1, values.size // LEVEL_SAMPLES)
-    kinds = np.sort(values[::stride][np.isfinite(values[::stride])])
-    apart = np.diff(kinds)
-    if np.count_nonzero(apart) < 2 or values.size < FEWEST_SAMPLES:
-        return 0.0
-    apart = apart[apart > 1e-9 * float(kinds[-1] - kinds[0])]
-    if not (apart.size and np.isfinite(apart).all()):  # numbers near the largest float have no differences
+    apart = _measure_levels(values)
+    if not apart.size or values.size < FEWEST_SAMPLES:
         return 0.0
     least = float(np.min(apart))
     # The least difference may be several steps where a level next to another never occurs.
@@ -115,6 +111,28 @@ def find_quantisation(values: VectorN) -> float:
         if _count_near(apart, step) > 0.98:
             return step
     return 0.0
+
+
+def has_step(values: VectorN, step: float) -> bool:
+    """Tell whether samples are multiples of a step as far as they tell: those of one level do."""
+    apart = _measure_levels(values)
+    if not apart.size:
+        return True
+    if not np.any(np.round(apart / step)):
+        return False
+    refined = _refine(apart, step)
+    return bool(_count_near(apart, refined) > 0.98 and abs(refined / step - 1.0) < WHOLE)
+
+
+def _measure_levels(values: VectorN) -> VectorK:
+    """Return how far the levels that samples take are apart; nothing where there are too few, or none is finite."""
+    stride = max(1, values.size // LEVEL_SAMPLES)
+    kinds = np.sort(values[::stride][np.isfinite(values[::stride])])
+    apart = np.diff(kinds)
+    if np.count_nonzero(apart) < 2:
+        return apart[:0]
+    apart = apart[apart > 1e-9 * float(kinds[-1] - kinds[0])]
+    return apart if np.isfinite(apart).all() else apart[:0]  # numbers near the largest float have no differences
 
 
 def _refine(apart: VectorK, step: float) -> float:

@@ -130,12 +130,69 @@ def test_a_step_that_the_readings_do_not_have_is_refused():
     log, step = record(0, 40)
     plant = so.plants.rotary(link="locked")
     with pytest.raises(
-        EstimationError, match=rf"quantisation of theta_m = .* steps of that apart, they are {step:.6g}"
+        EstimationError,
+        match=rf"^experiment bench: quantisation of theta_m = {0.7 * step:.6g} rad, .* are {step:.6g} rad apart; "
+        rf"write quantisation = {{ theta_m = {step:.6g} }}, or leave it out$",
     ):
-        so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation={"theta_m": 0.7 * step})
+        so.Experiment(plant=plant, log=log, name="bench", outputs=("theta_m",), quantisation={"theta_m": 0.7 * step})
     so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation={"theta_m": 0.5 * step})
     with pytest.raises(EstimationError, match="quantisation names"):
         so.Experiment(plant=plant, log=log, outputs=("theta_m",), quantisation={"theta_l": step})
+
+
+def test_a_log_with_finer_digits_than_its_stated_step_is_refused_when_it_is_read(tmp_path):
+    log, step = record(0, 40)
+    rows = np.column_stack([log.time, log["I"], np.round(log["theta_m"], 2)])
+    np.savetxt(tmp_path / "log.csv", rows, "%.8g", ",", header="t [s],I [A],theta_m [rad]", comments="")
+    (tmp_path / "knee.toml").write_text(
+        f"""
+        schema = 1
+        title = "held joint"
+        [parameters]
+        J_m = {{ value = 4e-5, free = true }}
+        [plant.bench]
+        kind = "rotary"
+        link = "locked"
+        [[experiment]]
+        name = "chirp"
+        plant = "bench"
+        log = "log.csv"
+        time = "t [s]"
+        inputs = {{ I = "I [A]" }}
+        outputs = {{ theta_m = "theta_m [rad]" }}
+        quantisation = {{ theta_m = {step:.6g} }}
+        """
+    )
+    with pytest.raises(
+        EstimationError, match=rf"experiment chirp: .* = {step:.6g} rad, .* 0\.01 rad apart .*finer digits"
+    ):
+        so.read_problem(tmp_path / "knee.toml").experiments()
+
+
+def test_readings_of_two_levels_do_not_contradict_a_step():
+    log, step = record(0, 40)
+    still = log.with_values(log.time, {"I": log["I"], "theta_m": step * (log["theta_m"] > 0.0)}, "a switch")
+    plant = so.plants.rotary(link="locked")
+    so.Experiment(plant=plant, log=still, outputs=("theta_m",), quantisation={"theta_m": 0.3 * step})
+
+
+def test_steps_of_two_encoders_are_kept_apart_where_causes_are_looked_for():
+    """A delay that is not stated, of two samples: looking for it took one output without its step, and failed."""
+    J, b, k, J_l, d, step = 1e-3, 5e-3, 2.0, 2e-3, 4e-3, 2.0 * np.pi / 4096
+    rng, t, f = np.random.default_rng(3), np.arange(4000) / RATE_HZ, np.arange(0.3, 8.0, 0.2)
+    torque = 0.02 * np.cos(2 * np.pi * np.outer(t, f) + rng.uniform(0, 2 * np.pi, f.size)).sum(axis=1)
+    a = np.array([[0, 1, 0, 0], [-k / J, -b / J, k / J, 0], [0, 0, 0, 1], [k / J_l, 0, -k / J_l, -d / J_l]])
+    held = cont2discrete((a, np.array([[0], [1 / J], [0], [0]]), np.eye(4)[::2], np.zeros((2, 1))), 1.0 / RATE_HZ)
+    angles = dlsim((*held[:4], 1.0 / RATE_HZ), np.concatenate([[0.0, 0.0], torque[:-2]]))[1]
+    motor, link = np.round((angles.T + 0.05 * step * rng.normal(size=(2, t.size))) / step) * step
+    log = so.Log.from_arrays(time=t, I=torque, theta_m=motor, theta_l=link)
+    plant = so.plants.rotary(link="free")
+    known = plant.defaults.update(N=1.0, K_tau=1.0, c_s=0.0, f_c=0.0)
+    start = known.update(J_m=1.3 * J, b_r=b, k_s=0.8 * k, J_l=J_l, d_l=d).free("J_m", "b_r", "k_s", "J_l", "d_l")
+    told = {"theta_m": step, "theta_l": step}
+    fit = so.fit([so.Experiment(plant=plant, log=log, outputs=tuple(told), quantisation=told)], start)
+    assert not fit.met
+    assert any("a delay of 4" in finding.text for finding in fit.findings if finding.kind == "cause")
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
