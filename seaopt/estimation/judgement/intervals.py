@@ -14,11 +14,14 @@ import numpy as np
 
 from seaopt.estimation.judgement.second_log import FAR, SECOND, find_excess, has_two_amplitudes
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.normal_equations import solve_seen
 from seaopt.estimation.problem.residual_statistics import compute_residuals
 from seaopt.estimation.problem.shapes import Signal
+from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError
+from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.estimation.solver.step_size import STEP_ERROR_PARAMETER, STEP_ERROR_SIGMA
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.parameters import QUANTILE, Parameter
@@ -34,6 +37,10 @@ MOVES = 0.01  # of the block in which an input moves the most
 LOUD = 6.0  # standard deviations of a reading's noise in a block, above which it moves
 FOLLOWED = 30.0  # standard deviations by which the outputs follow what is small: a tenth off is three of them off
 MORE = 1.5  # times the variance by white noise of its size, that rounding makes of a value: worth a word
+ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that chance does not give
+HALF = 0.5  # of a residual's power: what leaves less is another explanation, wherever the values are
+FAINT = 1e-6  # of an output's spread: a residual that is less is no motion
+ROUNDING = 1e-12  # of what an unknown does: less of it left is rounding
 READING = 0.05  # of a constant, up to which what is white about it is a reading's noise
 
 
@@ -131,6 +138,61 @@ def find_rounding(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
                 proposal=f"[[experiment]]\n{line}",
                 python=f'so.Experiment(..., quantisation={{"{output.name}": {step:.6g}}})',
             )
+
+
+def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
+    """Yield logs that do not begin in the state that is stated: with it free, in one step from the minimum, their
+    residuals fall by more than chance makes of residuals of this colour. Where that moves values beyond their
+    intervals, these are not to be believed.
+    """
+    minimum = fit.require_minimum("find_wrong_starts")
+    problem = minimum.problem
+    stated = {
+        e.name: replace(e.data, initial_state="estimate")
+        for e in problem.experiments
+        if e.data.initial_state != "estimate"
+    }
+    if not stated or fit.status != "converged":
+        return
+    freed, at = problem.rebuild(problem.params, minimum.z, stated)
+    freed = copy_steps(freed, problem)
+    for old, new in zip(problem.experiments, freed.experiments, strict=True):
+        for before, after in zip(old.segments, new.segments, strict=True):
+            for known, slot in zip(before.initial, after.initial, strict=True):
+                if slot.index is not None:
+                    at[slot.index] = known.at(minimum.z)
+    first = freed.evaluate(at)
+    if not np.all(np.isfinite(first.hessian)):
+        return
+    step = solve_seen(first.hessian, -first.gradient, ROUNDING)
+    second = freed.evaluate(np.clip(first.z + step, freed.unknowns.low, freed.unknowns.high))
+    best = min(first, second, key=lambda evaluation: evaluation.cost)
+    fitted, values = problem.evaluate(minimum.z).power, freed.unknowns.by_name(best.z)
+    moved = {name: abs(values[name] - fit.parameters[name].value) for name in fit.covariance.names}
+    beyond = {n: away for n, away in moved.items() if away > QUANTILE * (fit.parameters[n].total_std or 0.0)}
+    colour = measure_colour(fit.covariance, fit.white_covariance)
+    for experiment in problem.experiments:
+        name, sizes = experiment.name, experiment.sigma / np.maximum(experiment.spread, 1e-300)
+        if name not in stated:
+            continue
+        before, after = fitted[name].rms, best.power[name].rms
+        falls = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
+        # Of simulated logs without noise the residual is rounding, and the integration's error.
+        if float(fitted[name].counts @ falls) < ENOUGH * colour or np.max(before * sizes) < FAINT:
+            continue
+        gone = 1.0 - math.exp(-2.0 * float(np.max(falls)))
+        most = max(beyond, key=lambda n: beyond[n] / max(abs(values[n]), 1e-300), default="")
+        moves = f", and {most} = {values[most]:.4g} in place of {fit.parameters[most].value:.4g}" if most else ""
+        yield FitFinding(
+            severity="error" if beyond or gone > HALF else "warning",
+            kind="initial",
+            where=name,
+            text="does not begin at rest, or in the state that initial_state states: with that free, "
+            f"{100.0 * gone:.3g} % of a residual's power is gone{moves}; leave it free, with initial_state = "
+            '"estimate", or cut the log to where it rests, with slice_s',
+            proposal='[[experiment]]\ninitial_state = "estimate"',
+            python='so.Experiment(..., initial_state="estimate")',
+        )
 
 
 def _measure_waves(fit: Fit) -> dict[str, float]:

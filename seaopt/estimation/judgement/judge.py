@@ -28,6 +28,7 @@ from seaopt.estimation.judgement.intervals import (
     find_rounding,
     find_single_event,
     find_step_error,
+    find_wrong_starts,
 )
 from seaopt.estimation.judgement.score_test import Freed, ScoreTest, free_fixed, run_score_tests
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
@@ -120,6 +121,7 @@ def judge(
         *find_excesses(fit),
         *find_rough(fit, error),
         *find_rounding(fit, error),
+        *find_wrong_starts(fit),
         *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each))), minimum),
         *another,
     ]
@@ -148,6 +150,8 @@ def _search_causes(
     """Return the fit with intervals that reach to what explains it as well, its findings with the causes that are
     named, and what became of each hypothesis. `findings`: those yet; `evaluations`: those of a share of the budget.
     """
+    if any(finding.kind == "initial" and finding.severity == "error" for finding in findings):
+        return fit, findings, Search()  # what is left of a transient looks like much else
     noticed = (
         any(ratio > FAR for ratio in error.excess.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)

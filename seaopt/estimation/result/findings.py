@@ -33,14 +33,15 @@ class FitFinding:
 
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
     # for programs: "bound", "budget", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out",
-    # "noise", "quantisation", "range", "residual", "rough", "samples", "sharp", "starts", "step", "unjudged"
+    # "initial", "noise", "quantisation", "range", "residual", "rough", "samples", "sharp", "starts", "step", "unjudged"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy
     # value and std of what a "cause" frees, by name
     preferred: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
     together: tuple[str, ...] | None = None  # of those, what the "cause" that is named first frees
-    # what adds a "cause" that a part brings, lets friction jump, or states a "quantisation": lines of a problem file
+    # what adds a "cause" that a part brings, lets friction jump, states a "quantisation" or frees an "initial" state:
+    # lines of a problem file
     # (for a plant NAME, or an experiment), and calls
     proposal: str | None = None
     python: str | None = None

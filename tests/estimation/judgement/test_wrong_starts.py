@@ -1,0 +1,79 @@
+"""Logs that do not begin in the state that their experiment states, of joints that are simulated here."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import seaopt as so
+
+RATE_HZ, N, K_TAU, SUBSTEPS = 500.0, 50.0, 0.07, 20
+TRUTH = {"J_m": 4e-5, "b_r": 1e-3, "k_s": 300.0}
+
+
+def record(seed, *, lead_s=0.0, noise=1e-3, friction=0.0, seconds=10.0):
+    """Return the log of a held joint that began so many seconds earlier: in each of its exact steps dry friction is
+    what would stop it, at most `friction`.
+    """
+    rng, before = np.random.default_rng(seed), round(lead_s * RATE_HZ)
+    t, f = np.arange(round(seconds * RATE_HZ) + before) / RATE_HZ, np.arange(0.2, 12.0, 0.1)
+    current = np.cos(2 * np.pi * np.outer(t, f) + rng.uniform(0, 2 * np.pi, f.size)).sum(axis=1)
+    current /= current.std()
+    J_m, b_r, k_s = TRUTH.values()
+    rates = np.zeros((4, 4))
+    rates[:2] = [[0, 1, 0, 0], [-k_s / N**2 / J_m, -b_r / J_m, K_TAU / J_m, -1 / J_m]]
+    step = expm(rates / RATE_HZ / SUBSTEPS)[:2]
+    x, angle = np.zeros(2), np.empty(t.size)
+    for i, value in enumerate(current):
+        angle[i] = x[0]
+        for _ in range(SUBSTEPS):
+            x = step[:, :2] @ x + step[:, 2] * value
+            x = x + step[:, 3] * np.clip(-x[1] / step[1, 3], -friction, friction)
+    read = angle[before:] + noise * rng.normal(size=t.size - before)
+    return so.Log.from_arrays(time=t[: t.size - before], I=current[before:], theta_m=read)
+
+
+def fit(log, friction=0.0, **settings):
+    plant = so.plants.rotary(link="locked")
+    plant = so.plants.let_stick(plant) if friction else plant
+    start = {name: 1.2 * value for name, value in TRUTH.items()} | {"f_c": 1.2 * friction}
+    known = plant.defaults.update(K_tau=K_TAU, N=N, c_s=0.0, **start)
+    names = (*TRUTH, "f_c") if friction else tuple(TRUTH)
+    settings = {"initial_state": "rest", **settings}
+    bench = so.Experiment(plant=plant, log=log, name="chirp", outputs=("theta_m",), **settings)
+    return so.fit([bench], known.free(*names))
+
+
+def find_initial(result):
+    return [finding for finding in result.findings if finding.kind == "initial"]
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.02])
+def test_a_log_that_begins_in_motion_is_not_met_as_one_that_rested(friction):
+    log = record(1, lead_s=2.0, friction=friction)
+    wrong = fit(log, friction)
+    (finding,) = find_initial(wrong)
+    assert not wrong.met
+    assert (finding.severity, finding.where) == ("error", "chirp")
+    assert 'initial_state = "estimate"' in finding.text and "slice_s" in finding.text
+    assert finding.proposal == '[[experiment]]\ninitial_state = "estimate"'
+    assert not any(each.kind == "cause" for each in wrong.findings)  # nothing else is blamed
+    right = fit(log, friction, initial_state="estimate")
+    assert right.met and not find_initial(right)
+    for name, value in TRUTH.items():
+        assert right.parameters[name].value == pytest.approx(value, rel=2e-3)
+
+
+def test_a_wrong_position_is_noticed_as_a_wrong_speed_is():
+    assert find_initial(fit(record(2), initial_state={"theta_m": 0.3}))[0].severity == "error"
+
+
+def test_a_little_motion_at_the_start_is_noticed_under_much_noise():
+    (finding,) = find_initial(fit(record(1, lead_s=2.0, noise=0.1)))
+    assert finding.severity == "warning"
+
+
+@pytest.mark.parametrize("noise", [1e-3, 0.1])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_log_that_begins_at_rest_is_met(seed, noise):
+    right = fit(record(seed, noise=noise))
+    assert right.met and not find_initial(right)
