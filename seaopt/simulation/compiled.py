@@ -17,15 +17,15 @@ from jaxtyping import Bool, Float, Shaped
 
 from seaopt.errors import SimulationError
 from seaopt.plants.memo import memo
+from seaopt.records import record
 from seaopt.signals import VectorM, VectorX
 from seaopt.simulation.discretisation import Clock, transition
-from seaopt.simulation.halves import join_columns, moves_little
-from seaopt.simulation.integrator import output_function, rate_functions, step_function
+from seaopt.simulation.integrator import output_function, rate_functions, step_function, write_in_lanes
 from seaopt.simulation.model import Model
 from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, load_library, row_addresses
+from seaopt.simulation.parts import LANES, PARALLEL, count_parts, join_parts, moves_little
 from seaopt.simulation.passes import DoubleSum, Influence, Lagged, Layout, Pass, Point, Segment, Weights, layout_of
 
-PARALLEL = 20_000  # samples below which a second thread does not pay
 FORGOTTEN = 1e-24  # of a state, in any units: far below rounding
 LOSSES = ("square", "huber", "soft_l1")
 
@@ -66,8 +66,10 @@ def _count_delayed(model: Model, point: Point) -> int:
     return clock.delay_free * (2 if clock.hold == "first" or model.reads else 1)
 
 
-def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool) -> str:
-    """Return the C source of the passes of a model, over data with measured outputs or of simulations alone."""
+def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool, in_lanes: bool = False) -> str:
+    """Return the C source of the passes of a model, over data with measured outputs or of simulations alone.
+    `in_lanes`: of several stretches side by side, where the plant is smooth.
+    """
     constants = {
         "NX": model.nx,
         "NU": model.nu,
@@ -81,7 +83,7 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
         "DELAYED": delayed,
         "MEASURED": int(measured),
     }
-    generated = _write_sampling(model)
+    generated, lanes = _write_sampling(model), list[str]()
     if model.linear:
         constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
     else:
@@ -94,12 +96,20 @@ def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool)
         rates = rate_functions(model, moving=delayed == 2)
         patterns = (*rates.rate_pattern, *rates.output_pattern)
         constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
-        generated += generate_code(rates.rate, rates.output, *([rates.joint] if model.by_events else []))
-        generated += _chain_code("rate", rates.rate_pattern, model.nx)
-        generated += _chain_code("output", rates.output_pattern, model.ny)
-    tanh = ("tanh.h",) if re.search(r"\btanh\(", generated) else ()
-    headers = map(_text, ("sums.h", "stack.h", "layout.h", *tanh))
-    return "\n".join((define_constants(constants), *headers, generated, _text("pass.c")))
+        if in_lanes and measured and not (layout.corrected or model.by_events or generated):
+            lanes = [write_in_lanes(function) for function in (rates.rate, rates.output)]
+            lanes = lanes if all(lanes) else []
+        if lanes:
+            constants["CONSTANTS"] = rates.rate.numel_in(4)
+            generated = "".join(lanes)
+        else:
+            generated += generate_code(rates.rate, rates.output, *([rates.joint] if model.by_events else []))
+        generated += _chain_code("rate", rates.rate_pattern, model.nx, in_lanes=bool(lanes))
+        generated += _chain_code("output", rates.output_pattern, model.ny, in_lanes=bool(lanes))
+    tanh = ("tanh.h",) if re.search(r"\btanh\(|seaopt_tanh", generated) else ()
+    headers = ("sums.h", "stack.h", "layout.h", *tanh, *(("lanes.h",) if lanes else ()), "pass.h")
+    body = _text("lanes.c" if lanes else "pass.c")
+    return "\n".join((define_constants(constants), *map(_text, headers), generated, body))
 
 
 def _write_sampling(model: Model) -> str:
@@ -126,31 +136,40 @@ def _text(name: str) -> str:
     return files("seaopt.simulation").joinpath(name).read_text(encoding="utf-8")
 
 
-def _chain_code(name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int) -> str:
+def _chain_code(
+    name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int, *, in_lanes: bool
+) -> str:
     """Return the C function out = [0, A Z + B] for A, B of a sparsity pattern: one loop over derivatives per row."""
     a, b = pattern
+    kind, width, loop, entry = (
+        ("lanes", "NJ", "int j = 1; j < NJ; j++", "z[{}][j]")
+        if in_lanes
+        else ("double", "NJP", "int j = 0; j < NJP / 4; j++", "((const vec *)z[{}])[j]")
+    )
     lines = [
-        f"static inline void seaopt_{name}_chain(const double *a, const double *b,",
-        "        const double (*restrict z)[NJP], double (*restrict out)[NJP]) {",
+        f"static inline void seaopt_{name}_chain(const {kind} *a, const {kind} *b,",
+        f"        const {kind} (*restrict z)[{width}], {kind} (*restrict out)[{width}]) {{",
         "    const vec zero = {0.0, 0.0, 0.0, 0.0}; (void)zero;",
     ]
     for row in range(rows):
-        terms = " + ".join(f"a[{k}] * ((const vec *)z[{j}])[j]" for k, (i, j) in enumerate(a) if i == row)
-        lines.append(f"    for (int j = 0; j < NJP / 4; j++) ((vec *)out[{row}])[j] = {terms or 'zero'};")
+        terms = " + ".join(f"a[{k}] * {entry.format(j)}" for k, (i, j) in enumerate(a) if i == row)
+        to = f"out[{row}][j]" if in_lanes else f"((vec *)out[{row}])[j]"
+        lines.append(f"    for ({loop}) {to} = {terms or 'zero'};")
         lines += [f"    out[{row}][{1 + j}] += b[{k}];" for k, (i, j) in enumerate(b) if i == row]
     return "\n".join([*lines, "}\n"])
 
 
 @memo
-def load_passes(model: Model, layout: Layout, delayed: int, *, measured: bool) -> Kernel | None:
+def load_passes(model: Model, layout: Layout, delayed: int, *, measured: bool, in_lanes: bool) -> Kernel | None:
     """Return the compiled passes of a model, or None where there is no compiler."""
-    kernel = load_kernel(kernel_source(model, layout, delayed, measured=measured), "seaopt_passes")
+    source = kernel_source(model, layout, delayed, measured=measured, in_lanes=in_lanes)
+    kernel = load_kernel(source, "seaopt_passes")
     sums = _load_sums()
     if kernel is None or sums is None:
         return None
     table = ctypes.c_char.in_dll(sums, "seaopt_sums")
     ctypes.c_void_p.in_dll(kernel.library, "sums").value = ctypes.addressof(table)
-    kernel.library.carry_size.restype = ctypes.c_long
+    kernel.library.carry_size.restype = kernel.library.count_lanes.restype = ctypes.c_long
     return kernel
 
 
@@ -248,6 +267,21 @@ def _reuse_or_make(room: Any, shape: tuple[int, ...]) -> Any:
     return np.empty(shape) if room is None or len(room) < shape[0] else room[: shape[0]]
 
 
+@record(eq=False)
+class _Parts:
+    """Parts of a pass: their arguments, and what they point to, the sums and the ends of each part in a row."""
+
+    arguments: Shaped[np.ndarray, " parts"]
+    edges: Any
+    starts: Any
+    ends: Any
+    gram: Any
+    loss: Any
+    counts: Any
+    outputs: Any
+    columns: Any
+
+
 class Program:
     """The passes of one segment at one point, ready to run."""
 
@@ -276,18 +310,21 @@ class Program:
         for name, array in pointed.items():
             base[name] = self._address(array)
         self.base = base
-        long = segment.n >= PARALLEL and not (layout.corrected or weights.settle or len(weights.sections))
-        self.joins = long and not (model.linear or model.sticks)  # whether two halves may be joined, see `run_halves`
+        self.joins = kernel.library.count_lanes() > 1  # whether parts may be joined, see `run_parts`
         self.run_up = 0  # samples in which all of a state is forgotten, so that two halves may run at once; 0: serially
-        if model.linear and long:
+        filtered = layout.corrected or weights.settle or len(weights.sections)
+        if model.linear and segment.n >= PARALLEL and not filtered:
             a = data[-(model.nx + ny) * model.nx :].reshape(-1, model.nx)[: model.nx]
             self.run_up = _count_memory(a, segment.n // 8)
 
     @classmethod
-    def make(cls, model: Model, segment: Segment, point: Point, weights: Weights) -> Program | None:
-        """Return the program, or None where there is no compiler."""
+    def make(
+        cls, model: Model, segment: Segment, point: Point, weights: Weights, *, in_lanes: bool = False
+    ) -> Program | None:
+        """Return the program, or None where there is no compiler; `in_lanes`: one that may run in parts, if it can."""
         layout = layout_of(model.nx, model.ny, model.np, point)
-        kernel = load_passes(model, layout, _count_delayed(model, point), measured=bool(segment.y))
+        lanes, delayed = in_lanes and not len(weights.sections), _count_delayed(model, point)
+        kernel = load_passes(model, layout, delayed, measured=bool(segment.y), in_lanes=lanes)
         return None if kernel is None else cls(model, segment, point, weights, layout, kernel)
 
     def _address(self, array: Any, kind: Any = float) -> int:
@@ -335,48 +372,69 @@ class Program:
             kept["changes"] = np.zeros((n, nx))
         arguments = self._place(edges, warm, x0=starts, rho=loss, count=count, **{"gram": gram} if sums else {})
         arguments["output_rows"] = rows
-        follow = sums and resume is None and self.joins  # how a state depends on the first
-        carried = self.carry() if follow else resume
-        if carried is not None:
-            arguments["start"], arguments["carry"] = 0, carried.ctypes.data
+        if resume is not None:
+            arguments["start"], arguments["carry"] = 0, resume.ctypes.data
         for name, array in kept.items():
             if array is not None:
                 arguments[name] = array.ctypes.data
-        buffers = (self.memory, gram, loss, count, kept, starts, carried)
+        buffers = (self.memory, gram, loss, count, kept, starts, resume)
         self.kernel.run(arguments, buffers, parallel=n >= PARALLEL)
-        by_start = self._read_derivatives(carried)[:, -nx:] if follow and carried is not None else None
         sums_of = {name: np.sum(each, axis=0) for name, each in (("gram", gram), ("loss", loss), ("count", count))}
-        return Pass(**sums_of, **kept, sensitivity=by_start)
+        return Pass(**sums_of, **kept)
 
-    def run_halves(self, x0: VectorX, run_up: int, *, output_rows: int, columns: bool) -> Pass | None:
-        """Run all samples in two halves at once, the state of the second after a run-up; None where that is not the
-        state in which the first ends. See `seaopt.simulation.halves`.
+    def run_parts(
+        self, x0: VectorX, run_up: int, *, output_rows: int, columns: bool
+    ) -> tuple[Pass | None, Float[np.ndarray, "parts nx nx"]]:
+        """Run all samples in parts at once, the states of all but the first after a run-up; None where one is not the
+        state in which the part before ends. Returns the derivatives of each part's last state by its first, too. See
+        `seaopt.simulation.parts`.
         """
+        parts = self._cut(x0, count_parts(self.segment.n, run_up), output_rows=output_rows, columns=columns)
+        parts.arguments["run_up"][1:] = run_up
+        self.kernel.run(parts.arguments, (self.memory, parts), parallel=self.segment.n >= PARALLEL, least=LANES)
+        return self._join(parts) if self._meet(parts) else None, self._read_sensitivities(parts)
+
+    def _read_sensitivities(self, parts: _Parts) -> Float[np.ndarray, "parts nx nx"]:
+        return np.array([self._read_derivatives(end)[:, self.layout.start] for end in parts.ends])
+
+    def _cut(self, x0: VectorX, count: int, *, output_rows: int, columns: bool) -> _Parts:
+        """Return so many parts of all samples that are still to be run, all from the same state."""
         ny, nc, n = self.model.ny, self.layout.columns, self.segment.n
-        middle = (n + run_up) // 2  # the second half has its run-up besides
-        gram, loss, count = np.zeros((2, ny, nc, nc)), np.zeros((2, ny)), np.zeros((2, ny))
+        edges, starts = np.linspace(0, n, count + 1).astype(int), np.array([x0] * count, dtype=float)
+        gram, loss, counts = np.zeros((count, ny, nc, nc)), np.zeros((count, ny)), np.zeros((count, ny))
         outputs, v = np.empty((output_rows, ny)), np.empty((n if columns else 0, ny, nc))
-        starts, end = np.array([x0, x0], dtype=float), self.carry()
-        edges, warm = np.array([0, middle, n]), np.zeros(2, dtype=int)
-        arguments = self._place(edges, warm, x0=starts, rho=loss, count=count, gram=gram)
-        arguments["run_up"], arguments["carry"][0] = (0, run_up), end.ctypes.data
-        arguments["output_rows"] = min(output_rows, middle), max(output_rows - middle, 0)
-        arguments["outputs"] = outputs.ctypes.data + outputs.strides[0] * edges[:2]
+        ends = np.array([self.carry()] * count)
+        arguments = self._place(
+            edges, np.zeros(count, dtype=int), x0=starts, rho=loss, count=counts, gram=gram, carry=ends
+        )
+        arguments["output_rows"] = np.clip(output_rows - edges[:-1], 0, np.diff(edges))
+        arguments["outputs"] = outputs.ctypes.data + outputs.strides[0] * edges[:-1]
         if columns:
-            arguments["columns"] = v.ctypes.data + v.strides[0] * edges[:2]
-        self.kernel.run(arguments, (self.memory, gram, loss, count, outputs, v, starts, end))
-        z = self._read_derivatives(end)
-        if not moves_little(starts[1] - z[:, 0], gram[1], self.layout):
-            return None
-        join = join_columns(z, self.layout)
-        if columns:
-            v[middle:] = v[middle:] @ join
+            arguments["columns"] = v.ctypes.data + v.strides[0] * edges[:-1]
+        return _Parts(
+            arguments=arguments, edges=edges, starts=starts, ends=ends, gram=gram, loss=loss, counts=counts,
+            outputs=outputs if output_rows else None, columns=v if columns else None,
+        )  # fmt: skip
+
+    def _meet(self, parts: _Parts) -> bool:
+        """Tell whether each part begins where the one before ends."""
+        reached = (self._read_derivatives(end)[:, 0] for end in parts.ends)
+        pairs = zip(reached, parts.starts[1:], parts.gram[1:], strict=False)
+        return all(moves_little(start - end, gram, self.layout) for end, start, gram in pairs)
+
+    @np.errstate(all="ignore")  # a plant that overflows
+    def _join(self, parts: _Parts) -> Pass:
+        joins, at = join_parts([self._read_derivatives(end) for end in parts.ends], self.layout), self.layout.start
+        if parts.columns is not None:
+            for join, first, last in zip(joins[1:], parts.edges[1:], parts.edges[2:], strict=False):
+                rows = parts.columns[first:last].reshape(-1, self.layout.columns)
+                rows += rows[:, at] @ (join - np.eye(self.layout.columns))[at]
         return Pass(
-            gram=gram[0] + join.T @ gram[1] @ join,
-            loss=np.sum(loss, axis=0),
-            count=np.sum(count, axis=0),
-            outputs=outputs if output_rows else None,
-            columns=v if columns else None,
+            gram=np.sum(joins.transpose(0, 2, 1)[:, None] @ parts.gram @ joins[:, None], axis=0),
+            loss=np.sum(parts.loss, axis=0),
+            count=np.sum(parts.counts, axis=0),
+            outputs=parts.outputs,
+            columns=parts.columns,
         )
 
     def _read_derivatives(self, carried: VectorM) -> Float[np.ndarray, "nx nj"]:

@@ -12,6 +12,7 @@ of the numbers that the step computes.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any
 
@@ -151,6 +152,49 @@ def _take_reciprocals(expression: Any, arguments: list[Any], p: Any) -> tuple[An
             work[to] = value, any(varies)
     symbols, meanings = zip(*reciprocals.values(), strict=True) if reciprocals else ((), ())
     return ca.vertcat(*outputs), ca.vertcat(ca.SX(0, 1), *symbols), ca.vertcat(ca.SX(0, 1), *meanings)
+
+
+_LANES = {  # operations of vectors, as C,
+    **{"ASSIGN": "{0}", "ADD": "{0} + {1}", "SUB": "{0} - {1}", "MUL": "{0} * {1}", "DIV": "{0} / {1}", "NEG": "-{0}"},
+    **{"SQ": "{0} * {0}", "TWICE": "2.0 * {0}", "INV": "1.0 / {0}", "TANH": "seaopt_tanh_lanes({0})"},
+}
+_NUMBERS = {  # and of one number
+    **{"SIN": "sin({0})", "COS": "cos({0})", "TAN": "tan({0})", "ATAN": "atan({0})", "ATAN2": "atan2({0}, {1})"},
+    **{"EXP": "exp({0})", "LOG": "log({0})", "POW": "pow({0}, {1})", "CONSTPOW": "pow({0}, {1})", "SQRT": "sqrt({0})"},
+    **{"COSH": "cosh({0})", "SINH": "sinh({0})", "FMIN": "fmin({0}, {1})", "FMAX": "fmax({0}, {1})"},
+    **{"FABS": "fabs({0})", "COPYSIGN": "copysign({0}, {1})", "FLOOR": "floor({0})", "CEIL": "ceil({0})"},
+    **{"LT": "{0} < {1}", "LE": "{0} <= {1}", "EQ": "{0} == {1}", "NE": "{0} != {1}", "NOT": "!{0}"},
+    **{"AND": "{0} && {1}", "OR": "{0} || {1}", "IF_ELSE_ZERO": "{0} != 0.0 ? {1} : 0.0"},
+    "SIGN": "{0} < 0.0 ? -1.0 : {0} > 0.0 ? 1.0 : {0}",
+}
+
+
+def write_in_lanes(function: ca.Function) -> str:
+    """Return the C code of a function of numbers in several lanes; nothing where it has other operations than these."""
+    arguments = [f"a{i}" for i in range(function.n_in())]
+    results = [f"r{i}" for i in range(function.n_out())]
+    vectors, numbers = ({getattr(ca, f"OP_{name}"): c for name, c in table.items()} for table in (_LANES, _NUMBERS))
+    lines, places = list[str](), set[int]()
+    for k in range(function.n_instructions()):
+        operation, read, to = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+        places.update(to if operation != ca.OP_OUTPUT else read)
+        if operation == ca.OP_OUTPUT:
+            lines.append(f"{results[to[0]]}[{to[1]}] = w{read[0]};")
+        elif operation == ca.OP_INPUT:
+            lines.append(f"w{to[0]} = {arguments[read[0]]}[{read[1]}];")
+        elif operation == ca.OP_CONST and math.isfinite(function.instruction_constant(k)):
+            lines.append(f"w{to[0]} = zero + {function.instruction_constant(k)!r};")
+        elif operation in vectors:
+            lines.append(f"w{to[0]} = {vectors[operation].format(*(f'w{place}' for place in read))};")
+        elif operation in numbers:
+            value = numbers[operation].format(*(f"w{place}[l]" for place in read))
+            lines.append(f"for (int l = 0; l < LANES; l++) w{to[0]}[l] = {value};")
+        else:
+            return ""
+    head = ", ".join([*(f"const lanes *{name}" for name in arguments), *(f"lanes *{name}" for name in results)])
+    work = ["const lanes zero = {0.0}; (void)zero;", *(f"lanes w{place};" for place in sorted(places))]
+    name = f"static inline __attribute__((always_inline)) void {function.name()}({head}) {{"
+    return "\n    ".join([name, *work, *lines]) + "\n}\n"
 
 
 @record(eq=False)

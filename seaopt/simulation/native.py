@@ -260,17 +260,17 @@ class Kernel:
     function: Any
     library: ctypes.CDLL
 
-    def run(self, jobs: Shaped[np.ndarray, " jobs"], buffers: object, *, parallel: bool = True) -> None:
+    def run(self, jobs: Shaped[np.ndarray, " jobs"], buffers: object, *, parallel: bool = True, least: int = 1) -> None:
         """Do all jobs, in threads of their own if `parallel`; ctypes lets go of the interpreter's lock. `jobs`: one row
         per job, laid out as the C structure; pointers are whole numbers; `buffers`: whatever owns the memory that the
-        jobs point to; `parallel`: whether the jobs are long enough for threads to pay. Raises KeyboardInterrupt: once
-        no thread works on these jobs any more; those that none has begun are left. Raises MemoryError: there is no room
-        for the stack that a plant of many states needs.
+        jobs point to; `parallel`: whether the jobs are long enough for threads to pay; `least`: jobs of a thread.
+        Raises KeyboardInterrupt: once no thread works on these jobs any more; those that none has begun are left.
+        Raises MemoryError: there is no room for the stack that a plant of many states needs.
         """
         inside = threading.current_thread().name.startswith(
             THREAD_NAME
         )  # waiting for its own pool, it could wait forever
-        parts = min(max(len(jobs), 1), workers()) if parallel and not inside else 1
+        parts = min(max(len(jobs) // least, 1), workers()) if parallel and not inside else 1
         bounds, size = np.linspace(0, len(jobs), parts + 1).astype(int), jobs.dtype.itemsize
         spans = [(jobs.ctypes.data + int(a) * size, int(b - a)) for a, b in pairwise(bounds)]
         owners = (jobs, buffers)

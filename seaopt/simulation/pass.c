@@ -7,56 +7,6 @@
 
    Columns of v, for each output: residual, shared, initial state (NX), then the output's own: offset, drift, gain. With
    a correction the own columns of every output act on the state: then v holds those of all. */
-#include <string.h>
-#if defined(__SSE2__)
-#include <xmmintrin.h>
-#endif
-
-typedef struct {
-    const double *u[NU];
-    const double *y[NY];           /* of MEASURED */
-    const unsigned char *keep[NY]; /* NULL: all kept */
-    const long *steps;             /* of each row, unless LINEAR */
-    long from, to;                 /* rows of the log: first, and one past the last */
-    long length;                   /* rows: inputs are clamped to them */
-    long lead;                     /* rows of inputs that go before row 0 */
-    long shared;                   /* derivatives that all outputs share: parameters (NQ), then a free delay, then what only
-                                      the correction gain depends on */
-    long drift_terms;              /* per output */
-    long v_columns;                /* of v; NCP is the room for them, as NJP is for those of Z */
-    long lag_a, lag_b, lag_c;      /* rows of u in force: u[k - lag_a], and so on; clamped to the log */
-    long settle;                   /* rows from `start` that are left out while the filter settles */
-    long start;                    /* first row of the stretch; later than `from` is not allowed */
-    long output_rows;              /* rows from `from` whose outputs are kept */
-    long sections;                 /* of sos */
-    long loss;                     /* 0 squares, 1 Huber, 2 soft l1 */
-    long warm;                     /* rows from `from` that bring the state about, and are in no sum */
-    long run_up;                   /* rows before `from` through which the state goes alone, from x0 */
-    double t0;                     /* time of row 0 */
-    double tau0, dtau;             /* drift's coordinate, -1 to 1 over the log, at row 0, and its step */
-    const double *model;           /* LINEAR: D (NX + NY)(NX + NI)(NJP), A (NX + NY)(NX); else the step's settings, then c */
-    const double *correction;      /* CORRECT: NX x NY x NJP, gain and its derivatives */
-    double *x0;                    /* NX: the state at the first row; where the state runs up alone, given at its first row and
-                                      left as it is at `from` */
-    const double *offset, *gain;   /* NY */
-    const double *drift;           /* NY x drift_terms */
-    const double *sos;             /* sections x 5: b0 b1 b2 a1 a2 */
-    const double *knee;            /* NY: where a robust loss leaves the square */
-    double *gram;                  /* NY x v_columns x v_columns, added to, or NULL: no sums are made; without sums, columns
-                                      and influences there are no derivatives */
-    double *rho;                   /* NY: sum of losses, added to; unless gram is NULL */
-    double *count;                 /* NY: samples counted, added to; unless gram is NULL */
-    double *outputs;               /* output_rows x NY or NULL */
-    double *columns;               /* (to - from) x NY x v_columns or NULL */
-    double *states;                /* (to - from) x NX or NULL */
-    double *changes;               /* (to - from) x NX or NULL: of the next state, by steps of half the length from the same one; of
-                                      passes without derivatives */
-    double *carry;                 /* state between calls on one stretch, or NULL; see carry_size */
-    influences into;               /* of estimates, into.into NULL: none */
-} seaopt_pass_args;
-
-EXPORTED const column_sums *sums; /* of sums.c, set by who loads this */
-
 /* What goes on from one sample to the next. */
 typedef struct {
     double z[NX][NJP];
@@ -66,9 +16,6 @@ typedef struct {
 #define BLOCK 16
 #define ALL (NJP / 4) /* vectors of a row of Z */
 #define DERIVED(wide) (MEASURED && (wide) == ALL) /* whether derivatives are made, but for what shares a vector with x */
-#define INLINE static inline __attribute__((always_inline)) /* so that `wide` is a constant */
-#define ONCE static __attribute__((noinline)) /* what both ways of a pass share: compiling it twice takes longer than it saves */
-
 /* All that a sample touches stands close together. */
 typedef struct {
     double z[NX][NJP], next[NX][NJP], y[NY][NJP];
@@ -83,13 +30,6 @@ typedef struct {
 #endif
     double rho[NY], count[NY];
 } hot __attribute__((aligned(32)));
-
-static inline void at(const seaopt_pass_args *a, long k, long lag, double *u) {
-    long row = k - lag;
-    if (row < -a->lead) row = -a->lead;
-    if (row >= a->length) row = a->length - 1;
-    for (int i = 0; i < NU; i++) u[i] = a->u[i][row];
-}
 
 #if LINEAR
 #define NF (NX + NI)
@@ -145,8 +85,7 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, long times, int w
    is 2, f_p has a column for the delay, by which the input moves by du each second. Of a plant with a joint that sticks
    (JOINT, see events.py) the rate has the joint's mode as another argument, and there stands
      seaopt_joint(t, x, u, c) -> [speed, holding force, F(0)], d speed/dx, d speed/d theta, what a force adds to f.
-   model: period, older part of the period (fractional delay), first-order hold, then c. */
-#define SETTINGS 3
+   model: settings, then c. */
 
 typedef double hot_columns[NX][NJP] __attribute__((aligned(32)));
 
@@ -442,21 +381,6 @@ INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict
     output(q, t, u, du, m + SETTINGS, out, wide);
 }
 
-/* A reading at a place s in the period, 0 to 1, with du per unit of s: the cubic through both samples that has there the
-   slopes between their neighbours (Catmull and Rom 1974). */
-static inline double follow(const seaopt_pass_args *a, long k, int c, double s, double *du) {
-    double w[4];
-    for (int i = 0; i < 4; i++) {
-        long row = k - 1 + i;
-        if (row < -a->lead) row = -a->lead;
-        if (row >= a->length) row = a->length - 1;
-        w[i] = a->u[c][row];
-    }
-    const double c1 = 0.5 * (w[2] - w[0]), c3 = 0.5 * (w[3] - w[0]) + 1.5 * (w[1] - w[2]), c2 = w[2] - w[1] - c1 - c3;
-    *du = c1 + s * (2.0 * c2 + 3.0 * s * c3);
-    return w[1] + s * (c1 + s * (c2 + s * c3));
-}
-
 /* With a fractional delay the older input acts first, for m[1] seconds: u_b held, or the line from u_c to u_a; then u_a
    held, or the line from u_a to u_b. */
 INLINE void advance(hot *q, const seaopt_pass_args *a, long k, long times, int wide) {
@@ -536,21 +460,6 @@ ONCE void filtered(const seaopt_pass_args *a, double *restrict v, double (*restr
     }
 }
 
-static inline double robust(const seaopt_pass_args *a, int o, double r, double *rho) {
-    const double knee = a->knee[o], size = fabs(r);
-    if (a->loss == 2) {
-        const double part = r / knee, root = sqrt(1.0 + part * part);
-        *rho = knee * knee * (root - 1.0);
-        return 1.0 / root;
-    }
-    if (a->loss == 0 || size <= knee) {
-        *rho = 0.5 * r * r;
-        return 1.0;
-    }
-    *rho = knee * (size - 0.5 * knee);
-    return knee / size;
-}
-
 static inline void sum_waiting(const seaopt_pass_args *a, hot *q, int o) {
     sums->add_products(q->v[o][0], q->weight[o], q->waiting[o], q->sum[o][0], NCP);
     q->waiting[o] = 0;
@@ -567,31 +476,7 @@ static inline void accumulate(const seaopt_pass_args *a, hot *q, int o) {
     if (k + 1 == BLOCK) sum_waiting(a, q, o);
 }
 
-/* Denormal numbers, into which sensitivities to the initial state decay, cost a hundredfold: take them as zero. */
-static unsigned long flush_denormals(void) {
-#if defined(__SSE2__)
-    const unsigned int before = _mm_getcsr();
-    _mm_setcsr(before | 0x8040);
-    return before;
-#elif defined(__aarch64__)
-    unsigned long before;
-    __asm__ volatile("mrs %0, fpcr" : "=r"(before));
-    __asm__ volatile("msr fpcr, %0" : : "r"(before | (1UL << 24)));
-    return before;
-#else
-    return 0;
-#endif
-}
-
-static void restore_denormals(unsigned long before) {
-#if defined(__SSE2__)
-    _mm_setcsr((unsigned int)before);
-#elif defined(__aarch64__)
-    __asm__ volatile("msr fpcr, %0" : : "r"(before));
-#else
-    (void)before;
-#endif
-}
+EXPORTED long count_lanes(void) { return 1; }
 
 EXPORTED long carry_size(void) { return sizeof(state) / sizeof(double) + 1; }
 
@@ -673,19 +558,6 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
     deliver(q, a);
 }
 
-/* What goes on in a state that is let go `run_up` rows before a pass begins. */
-ONCE void run_up(const seaopt_pass_args *a) {
-    state reached;
-    seaopt_pass_args alone = *a;
-    alone.from = alone.start = a->from - a->run_up;
-    alone.to = a->from;
-    alone.gram = alone.outputs = alone.columns = alone.states = alone.changes = 0;
-    alone.into.into = 0;
-    alone.carry = (double *)&reached;
-    one_pass(&alone, 1);
-    for (int i = 0; i < NX; i++) a->x0[i] = reached.z[i][0];
-}
-
 typedef struct { const seaopt_pass_args *list; long count; } jobs;
 
 static void *run_jobs(void *given) {
@@ -693,7 +565,6 @@ static void *run_jobs(void *given) {
     const unsigned long mode = flush_denormals();
     for (long i = 0; i < all->count; i++) {
         const seaopt_pass_args *one = all->list + i;
-        if (one->run_up) run_up(one);
         if (MEASURED && (ALL == 1 || one->gram || one->columns || one->into.into)) one_pass(one, ALL);
         else one_pass(one, 1);
     }
@@ -702,7 +573,7 @@ static void *run_jobs(void *given) {
 }
 
 /* Both ways of a pass have their arrays in one frame; then come those of a step, of CasADi's functions, and of influences. */
-#define STACK (3 * sizeof(hot) + sizeof(state) + sizeof(double) * (24 * (NX + NY) * (NJP + 2 * NU + 2) + 4 * NY * NY))
+#define STACK (2 * sizeof(hot) + sizeof(double) * (24 * (NX + NY) * (NJP + 2 * NU + 2) + 4 * NY * NY))
 
 EXPORTED int seaopt_passes(const seaopt_pass_args *list, long count) {
     jobs all = {list, count};

@@ -189,6 +189,11 @@ class Layout:
         return 1 + self.shared + self.nx + (self.ny * self.per_output if self.corrected else 0)
 
     @property
+    def start(self) -> slice:
+        """The columns of the initial state."""
+        return slice(1 + self.shared, 1 + self.shared + self.nx)
+
+    @property
     def columns(self) -> int:
         """Columns of v."""
         return 1 + self.shared + self.nx + (self.ny if self.corrected else 1) * self.per_output
@@ -206,7 +211,6 @@ class Pass:
     chosen: Int[np.ndarray, " nc"] | None = None  # which of those columns are this pass's; all if None
     states: Float[np.ndarray, "n nx"] | None = None  # state trajectory
     changes: Float[np.ndarray, "n nx"] | None = None  # of each sample's next state, by steps of half the length
-    sensitivity: Float[np.ndarray, "nx nx"] | None = None  # of the last state to the first: long logs, nonlinear plants
 
 
 def layout_of(nx: int, ny: int, np_: int, point: Point) -> Layout:

@@ -14,13 +14,14 @@ import numpy as np
 from seaopt.signals import VectorX
 from seaopt.simulation.compiled import Program, double_sum_of_columns
 from seaopt.simulation.discretisation import check_period
-from seaopt.simulation.halves import find_run_up
 from seaopt.simulation.interpreted import interpret_pass, read_measured
 from seaopt.simulation.model import Model
+from seaopt.simulation.parts import count_parts, find_run_up, guess_run_up
 from seaopt.simulation.passes import DoubleSum, Influence, Lagged, Pass, Point, Segment, Weights
 
 STREAM_SAMPLES = 1 << 16  # of a stream that are in memory at a time
 KEPT_BYTES = 1 << 28  # of the passes that are kept at a time
+ATTEMPTS = 2  # at a pass in parts, the second with the run-up that the first asks for
 
 Asked: TypeAlias = tuple[Model, Segment, Point, VectorX, Weights]  # of a pass: what is simulated, from which state
 
@@ -146,17 +147,20 @@ def run_passes(
     chosen = weights if weights is not None else Weights.plain(model.ny)
     last = segment.n if stop is None else stop
     rows = (last if output_rows is None else min(output_rows, last)) if outputs else 0
-    kept = _kept.get() if sums and last == segment.n and not (states or changes) else None
+    store = _kept.get()
+    kept = store if sums and last == segment.n and not (states or changes) else None
     key = _key(model, segment, point, x0, chosen) if kept is not None else None
     result = kept.find(key, rows, columns=columns or keep) if kept is not None else None
     if result is None:
         whole = keep and kept is not None
         made = last if whole else rows
-        program = Program.make(model, segment, point, chosen)
+        in_lanes = store is not None and count_parts(segment.n) > 1 and store.find_run_up(segment) != 0
+        program = Program.make(model, segment, point, chosen, in_lanes=in_lanes)
         if program is None:
             result = interpret_pass(model, segment, point, chosen, last, x0, changes=changes)
         elif kept is not None:
-            result = _run_kept(kept, program, x0, output_rows=made, columns=columns or whole)
+            asked = model, segment, point, x0, chosen
+            result = _run_kept(kept, program, asked, output_rows=made, columns=columns or whole)
         else:
             result = program.run(
                 0,
@@ -180,19 +184,23 @@ def run_passes(
     )
 
 
-def _run_kept(kept: _Kept, program: Program, x0: VectorX, *, output_rows: int, columns: bool) -> Pass:
-    """Run a whole segment with its sums: as two halves at once where an earlier pass shows that it forgets a state."""
-    segment = program.segment
-    run_up = kept.find_run_up(segment) if program.joins else 0
-    if run_up:
-        result = program.run_halves(x0, run_up, output_rows=output_rows, columns=columns)
+def _run_kept(kept: _Kept, program: Program, asked: Asked, *, output_rows: int, columns: bool) -> Pass:
+    """Run a whole segment with its sums: as parts at once, as long as none shows that it remembers a state for long."""
+    model, segment, point, x0, weights = asked
+    known = kept.find_run_up(segment)
+    run_up = guess_run_up(segment.n) if known is None else known
+    for _ in range(ATTEMPTS if program.joins and run_up else 0):
+        result, sensitivities = program.run_parts(x0, run_up, output_rows=output_rows, columns=columns)
+        if result is None or known is None:
+            run_up = find_run_up(sensitivities, segment.n, least=2 * run_up if result is None else 0)
+            kept.keep_run_up(segment, run_up)
         if result is not None:
             return result
-        kept.keep_run_up(segment, 0)
-    result = program.run(0, segment.n, x0, outputs=output_rows > 0, output_rows=output_rows, columns=columns)
-    if run_up is None and result.sensitivity is not None:
-        kept.keep_run_up(segment, find_run_up(result.sensitivity, segment.n))
-    return result
+        if not run_up:
+            break
+    alone = Program.make(model, segment, point, weights) if program.joins else program
+    assert alone is not None
+    return alone.run(0, segment.n, x0, outputs=output_rows > 0, output_rows=output_rows, columns=columns)
 
 
 def keep_part(smaller: Asked, larger: Asked, columns: Sequence[int]) -> None:

@@ -1,4 +1,4 @@
-"""Samples that take different numbers of steps: compiled, by CasADi's interpreter, in halves, and sample by sample."""
+"""Samples that take different numbers of steps: compiled, by CasADi's interpreter, in parts, and sample by sample."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 from seaopt.simulation import Weights, run_passes
 from seaopt.simulation.compiled import Program
 from seaopt.simulation.interpreted import interpret_pass
-from tests.simulation.test_halves import SAMPLES, X0, assert_same, make_program
+from tests.simulation.test_parts import SAMPLES, X0, assert_same, make_program
 
 MOST = 6
 
@@ -30,13 +30,14 @@ def test_every_sample_takes_its_share(shared):
     assert np.array_equal(replace(point, substeps=1, stable=1).count_steps(segment), np.ones(SAMPLES))
 
 
-def test_compiled_interpreted_and_in_halves(shared):
+def test_compiled_interpreted_and_in_parts(shared):
     model, segment, point = shared
     program = Program.make(model, segment, point, Weights.plain(1))
     whole = program.run(0, SAMPLES, X0, outputs=True, columns=True)
     interpreted = interpret_pass(model, segment, point, Weights.plain(1), SAMPLES, X0)
     assert_same(whole, interpreted, 1e-9)
-    assert_same(program.run_halves(X0, 4000, output_rows=SAMPLES, columns=True), whole, 1e-11)
+    program = Program.make(model, segment, point, Weights.plain(1), in_lanes=True)
+    assert_same(program.run_parts(X0, 1500, output_rows=SAMPLES, columns=True)[0], whole, 1e-11)
 
 
 @pytest.mark.parametrize("halved", [False, True])

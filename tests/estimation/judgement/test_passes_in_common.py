@@ -58,7 +58,7 @@ def test_a_right_model_is_judged_by_one_more_pass(f_c, monkeypatch):
     """With the parameters that were fixed, and with the effects that a log may not show."""
     problem = pose(f_c)
     made: list[tuple[str, ...]] = []
-    for name in ("run", "run_halves"):
+    for name in ("run", "run_parts"):
         real = getattr(Program, name)
 
         def run(program, *args, real=real, **options):
