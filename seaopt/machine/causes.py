@@ -475,7 +475,8 @@ def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
     terms = [] if added is None else [name for name in ("friction", "gravity", "ripple") if getattr(added, name)]
     for name in terms:
         without = replace(added, **{name: None}) if added is not None and len(terms) > 1 else None
-        yield Alternative(kind="compensation", what=name, change=_change_law(linear=True, compensation=without))
+        change = _change_law(linear=not isinstance(law, ForceMPC), compensation=without)
+        yield Alternative(kind="compensation", what=name, change=change)
     if setting.controller.link is not None:
         change = _change_ticks(
             lambda rows: replace(rows, measured=rows.measured * _all_but_last(rows.measured.shape[1]))

@@ -22,15 +22,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from seaopt.control import (
     Controller,
+    ControllerSpec,
     ForceMPC,
     LawState,
+    MPCSpec,
     MPCState,
     RunnableLaw,
     RunnableSchedule,
@@ -61,6 +63,7 @@ LONGEST_RESPONSE = 5000  # rows after which an impulse has left what the integra
 Source = Controller | ScheduledController | ForceMPC
 Others = Mapping[str, Source]  # laws that may have run in a law's place, by name
 State = LawState | MPCState
+Spec = TypeVar("Spec", ControllerSpec, MPCSpec)
 
 
 @record(eq=False)
@@ -134,13 +137,15 @@ def _run_plan(
 ) -> tuple[Float[np.ndarray, " n"], MPCState]:
     """Return the commands of predictive control, and its last state; `follow`: as if each command were the log's."""
     out, ahead = np.empty(len(ticks)), law.spec.preview_samples + 1
+    reads = 0 if law.compensation is None else len(law.compensation.reads)
     for k in range(len(ticks)):
         before = state.kalman
-        result = law.step(state, ticks.reference[k : k + ahead], float(ticks.measured[k, 0]))
+        readings = ticks.further[k, :reads].tolist()
+        result = law.step(state, ticks.reference[k : k + ahead], float(ticks.measured[k, 0]), readings)
         out[k], state = result.current_A, result.state
         if follow:
             line = np.vstack([before.past, np.zeros(before.past.shape[1])])
-            line[-1, 0] = ticks.command[k]
+            line[-1, 0] = ticks.command[k] - result.state.terms[1] * law.per_effort
             kalman = law.kalman.go_on(line, state.kalman.corrected, state.kalman.innovation)
             state = replace(state, current_A=float(ticks.command[k]), kalman=kalman)
     return out, state
@@ -188,9 +193,18 @@ def limit_law(law: RunnableLaw | RunnableSchedule | ForceMPC, limit: float) -> A
     """Return a law with another limit of its command."""
     if not isinstance(law, ForceMPC):
         return replace(law, command_limit=limit)
-    plant, values = law.design
-    spec = replace(law.spec, **{"current_limit_A" if law.spec.current_limit_A is not None else "command_limit": limit})
-    return force_mpc(plant, values, spec, gate=law.gate, heat=law.heat)
+    return change_plan(law, limit_spec(law.spec, limit))
+
+
+def change_plan(plan: ForceMPC, spec: MPCSpec) -> ForceMPC:
+    """Return predictive control of another specification, with the same around it."""
+    changed = force_mpc(*plan.design, spec, gate=plan.gate, heat=plan.heat)
+    return replace(changed, outer=plan.outer, compensation=plan.compensation)
+
+
+def limit_spec(spec: Spec, limit: float) -> Spec:
+    """Return a specification with another limit of its command."""
+    return replace(spec, **{"current_limit_A" if spec.current_limit_A is not None else "command_limit": limit})
 
 
 @record(eq=False)

@@ -38,9 +38,13 @@ def complete_controller(problem: Problem, controller: Controller, source: Fit | 
     """Return a controller with the problem's outer loop, its guards, and with what it compensates. Raises
     SeaoptError: as `seaopt.control.add_compensation`, or the stiffness has no critically damped impedance.
     """
+    return _guard(problem, surround_controller(problem, controller, source), source)
+
+
+def surround_controller(problem: Problem, controller: Controller, source: Fit | ParameterSet) -> Controller:
+    """Return a controller with the problem's outer loop and with what it compensates."""
     values = problem.values(source)
-    (controller,) = add_outer_loop(problem, [(controller, values)])
-    controller, terms = _guard(problem, controller, source), _list_terms(problem, values)
+    (controller,), terms = add_outer_loop(problem, [(controller, values)]), _list_terms(problem, values)
     return add_compensation(controller, **terms) if terms else controller
 
 

@@ -12,8 +12,6 @@ from seaopt.problem.schema import MPC, ControllerTable, MPCTable, ProblemTable
 PLANNED = {field.name: field.kind for field in list_options(MPCSpec)}
 SHARED = PLANNED.keys() & ControllerTable.model_fields.keys() - {"measured"}  # keys of [controller] that a plan has too
 
-ADDED = ("compensate", "link_feedforward")  # keys of [controller] for what is added to a command
-
 
 def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
     """Return what a file asks of predictive control; None where it asks for gains, or for no controller. Raises
@@ -32,20 +30,14 @@ def make_mpc_spec(table: ProblemTable) -> MPCSpec | None:
 
 
 def _check_keys(table: ProblemTable, controller: ControllerTable) -> None:
-    taken = {"plant", "measured", "structure", "gate", "derate", *SHARED}
+    taken = {"plant", "measured", "structure", "gate", "derate", "compensate", *SHARED}
     if all(name.startswith(RESPONSE) for name in controller.robust_to):  # which its linear region is certified on
         taken.add("robust_to")
     stated = sorted(controller.model_fields_set - taken)
-    terms = controller.compensation
-    if stated[:1] == ["compensate"] and terms.gravity is not None and terms.friction is None and terms.ripple is None:
+    if stated[:1] == ["link_feedforward"]:
         raise ProblemError(
-            'controller.compensate.gravity adds to the reference, and structure = "mpc" takes it as it is given: no '
-            "plan runs with it, so that nothing is shown of the loop that it closes; take it out, or take gains"
-        )
-    if stated and stated[0] in ADDED:
-        raise ProblemError(
-            f"controller.{stated[0]} adds to the command behind the law, and a plan keeps limits and rate of the "
-            'command itself: with structure = "mpc" it would exceed them; take it out'
+            "controller.link_feedforward is made of a plant of robust_to whose link moves, and "
+            'structure = "mpc" is designed on one plant alone; take it out'
         )
     if stated:
         raise ProblemError(f'controller.{stated[0]} shapes gains, and structure = "mpc" has none; take it out')

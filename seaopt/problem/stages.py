@@ -38,12 +38,12 @@ from seaopt.logs import Log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem.completion import (
-    add_outer_loop,
     complete_controller,
     complete_schedule,
     derates,
     find_outer,
     make_gate,
+    surround_controller,
 )
 from seaopt.problem.problem import WRITE_ONE, Problem
 from seaopt.progress import Progress, count_off, ignore
@@ -154,10 +154,10 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
     mpc = force_mpc(problem.design_plant, source, problem.mpc)
     heat = mpc.heat_guard if derates(problem, mpc) else None
     mpc = replace(mpc, gate=make_gate(problem, mpc, source), heat=heat)
-    if problem.table.impedance is None:
+    if problem.table.impedance is None and not problem.controller_table.compensate:
         return mpc
-    (rendered,) = add_outer_loop(problem, [(linear_controller(mpc), problem.values(source))])
-    return replace(mpc, outer=rendered.outer)
+    law = surround_controller(problem, linear_controller(mpc), source)
+    return replace(mpc, outer=law.outer, compensation=law.compensation)
 
 
 def check_mpc_file(problem: Problem, mpc: ForceMPC, path: Path, remedy: str) -> None:

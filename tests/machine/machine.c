@@ -7,7 +7,11 @@
 #include "force_mpc.h"
 #define LAW force_mpc
 #define START(law) force_mpc_reset(law)
+#if FORCE_MPC_TERMS
+#define STEP(law, r, y, place) (force_mpc_terms(law, r, &(place)), force_mpc_step(law, r, y))
+#else
 #define STEP(law, r, y, place) force_mpc_step(law, r, y)
+#endif
 #else
 #include "force_law.h"
 #define LAW force_law_law

@@ -66,7 +66,7 @@ class Bench:
 
     def __init__(self, compiler, folder, controller, name="law", *, exported=False):
         self.controller, self.folder = controller, Path(folder) / name
-        kind = ["-DPLAN"] if isinstance(controller, ForceMPC) else []
+        kind = ["-DPLAN", "-DREADS"] if isinstance(controller, ForceMPC) else []
         if isinstance(controller, ScheduledController):
             kind = ["-DPLACED"]
         elif isinstance(controller, Controller) and controller.further:
@@ -113,8 +113,8 @@ class Bench:
                 columns | {self.controller.over: places},
                 units | {self.controller.over: self.controller.unit},
             )
-        elif isinstance(law, Controller) and law.further:
-            columns, units = columns | {law.further[0]: place}, units | {law.further[0]: "m"}
+        elif further := law.further if isinstance(law, Controller) else law.compensation and law.compensation.reads:
+            columns, units = columns | {further[0]: place}, units | {further[0]: "m"}
         return so.Log.from_arrays(**columns, units=units, source="bench")
 
 

@@ -19,6 +19,7 @@ from seaopt.control import (
     tune_schedule,
 )
 from seaopt.control.laws.structures import Gains
+from seaopt.control.loops.compensation.terms import Compensation, GravityTerm
 from seaopt.control.running.law_step import run_law
 from seaopt.formatting import format_number
 from seaopt.machine.design_run import run_design
@@ -200,6 +201,33 @@ def test_predictive_control_at_its_limits_is_replayed(planned):
     log = planned.log(Machine(), jump)
     (row,) = so.accept(planned.controller, [log]).replays
     assert row.met and row.saturated > 0.02 and row.largest < 1e-6
+
+
+@pytest.mark.parametrize("limited", [False, True])
+def test_a_weight_beside_predictive_control_is_replayed_and_missed(planned, limited, compiler, tmp_path):
+    """Its C adds the weight of what is read; where that is left out, the log is of another law."""
+    weight = GravityTerm(coefficients=(4.0, 150.0), low=-1e-3, high=1e-3, reads="q", unit="m", fraction=1.0)
+    mpc = replace(
+        planned.controller, compensation=Compensation(sample_time_s=planned.controller.sample_time_s, gravity=weight)
+    )
+    reference = np.where(np.arange(800) % 400 < 200, 0.0, 2400.0) if limited else SHORT[:1000]
+    log = Bench(compiler, tmp_path, mpc).log(Machine(), reference)
+    (row,) = so.accept(mpc, [log]).replays
+    assert row.met and row.largest < 1e-6 and (row.saturated > 0.02) is limited
+    force = planned.log(Machine(), reference)
+    without = so.Log.from_arrays(
+        time=force.time,
+        source="bench",
+        reference=force["reference"],
+        F1=force["F1"],
+        I=force["I"],
+        q=force["F1"] / 655e3,
+    )
+    (row,) = so.accept(mpc, [without]).replays
+    assert not row.met and (row.causes[0].kind, row.causes[0].what) == ("compensation", "gravity"), row.causes
+    assert row.causes[0].explains
+    lower = limit_law(mpc, 4.5)
+    assert lower.command_limit == 4.5 and lower.compensation.gravity == weight
 
 
 @pytest.mark.slow

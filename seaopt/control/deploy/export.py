@@ -479,8 +479,7 @@ def _write_gravity(term: GravityTerm, number: Writer) -> dict[str, Any]:
 
 def _write_ripple(term: RippleTerm, number: Writer) -> dict[str, Any]:
     """Return the compensation of torque ripple as text, every harmonic up to the last."""
-    series = {n: (cos, sin) for n, cos, sin in zip(term.cycles, term.cos, term.sin, strict=True)}
-    rows = [series.get(n, (0.0, 0.0)) for n in range(1, max(term.cycles) + 1)]
+    rows = term.harmonics
     return {
         "terms": len(rows),
         "cos": ", ".join(number(cos) for cos, _ in rows),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -11,8 +12,10 @@ from typing import Annotated, Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.codec import Constraints, to_content
+from seaopt.codec import Constraints, Fields, to_content
 from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
@@ -39,12 +42,21 @@ class MPCCode:
     rows: Float[np.ndarray, "r nv"]
     heat: HeatGuard | None = None
     outer: OuterLoop | None = None
+    terms: Annotated[Mapping[str, Any], Fields(of=Compensation)] | None = None
+
+    @property
+    def compensation(self) -> Compensation | None:
+        """What is compensated; None for nothing."""
+        return None if self.terms is None else Compensation(sample_time_s=self.numbers["sample_time_s"], **self.terms)
 
     @property
     def parts(self) -> dict[str, str]:
         """The files of what stands around the plan, by name."""
-        heat, outer = self.heat, self.outer
-        files = {"heat.h": heat and _format_heat(heat), "outer.h": outer and _format_outer(outer)}
+        heat, outer, terms = self.heat, self.outer, self.compensation
+        files = {
+            "heat.h": heat and _format_heat(heat), "outer.h": outer and _format_outer(outer),
+            "terms.h": terms and _format_terms(terms),
+        }  # fmt: skip
         return {name: text for name, text in files.items() if text}
 
     def to_dict(self) -> dict[str, Any]:
@@ -116,6 +128,10 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "UNIT": mpc.design[0].outputs[mpc.measured],
         "DELAYS": mpc.delays,
     }
+    if (terms := mpc.compensation) is not None:
+        numbers |= {"per_effort": mpc.per_effort, "sample_time_s": terms.sample_time_s}
+        read = {**mpc.design[0].outputs, **{term.reads: term.unit for term in (terms.gravity, terms.ripple) if term}}
+        units["READ"] = ", ".join(f"{name} in {read[name]}" if read.get(name) else name for name in terms.reads)
     code = MPCCode(
         sizes=sizes,
         numbers={name: value for name, value in numbers.items() if np.isfinite(value)},
@@ -124,6 +140,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         hessian=stack_hessian(prediction),
         rows=prediction.rows,
         outer=mpc.outer,
+        terms=terms and {name: getattr(terms, name) for name in terms.json_keys},
     )
     return set_heat(set_gate(code, mpc.gate, spec.sample_time_s), mpc.heat)
 
@@ -149,7 +166,9 @@ def _format_data(code: MPCCode, single_precision: bool, uncertified: str) -> str
     numbers = {**code.numbers, "tolerance": tolerance, "dependent": dependent}
     arrays = {**code.arrays, "inverse": program.inverse, "normals": program.normals, "scale": program.scale}
     lines = [f"typedef {'float' if single_precision else 'double'} force_mpc_real;"]
-    lines += [f"#define FORCE_MPC_{name} {value}" for name, value in code.sizes.items()]
+    lines += [
+        f"#define FORCE_MPC_{name} {value}" for name, value in {**code.sizes, **_place_terms(code.compensation)}.items()
+    ]
     lines += [f'#define FORCE_MPC_{name} "{text}"' for name, text in code.units.items()]
     lines += [f"static const force_mpc_real mpc_{name} = {_format_number(value)};" for name, value in numbers.items()]
     lines += [_format_array(name, value) for name, value in arrays.items()]
@@ -182,13 +201,53 @@ def _format_heat(heat: HeatGuard) -> str:
 
 
 def _format_outer(outer: OuterLoop) -> str:
-    """Return the outer loop as C: its numbers, the direction in its gains, and the text that laws have."""
+    """Return the outer loop as C: its numbers, the direction in its gains."""
     numbers = {
         "OUTER_STIFFNESS": outer.direction * outer.stiffness, "OUTER_DAMPING": outer.direction * outer.damping,
         "OUTER_POLE": outer.pole, "OUTER_RATE": outer.rate,
     }  # fmt: skip
-    lines = [f"static const real {name} = {_format_number(value)};" for name, value in numbers.items()]
-    return "\n".join([f"/* {outer.describe()}. */", *lines, "", _read_template("outer.c")])
+    return _format_part(outer.describe(), numbers, "outer.c")
+
+
+def _format_terms(terms: Compensation) -> str:
+    """Return what is compensated as C: the numbers of each term."""
+    numbers, texts = dict[str, float | Sequence[float]](), list[str]()
+    if terms.gravity is not None:
+        middle, scale, *series = terms.gravity.numbers
+        numbers |= {"GRAVITY": series, "GRAVITY_MIDDLE": middle, "GRAVITY_SCALE": scale}
+        texts.append("gravity.c")
+    if terms.ripple is not None:
+        cos, sin = zip(*terms.ripple.harmonics, strict=True)
+        numbers |= {"RIPPLE_COS": cos, "RIPPLE_SIN": sin, "SINE": SINE, "COSINE": COSINE}
+        numbers |= {"REVOLUTIONS": terms.ripple.numbers[0], "MOST_TURNS": MOST_TURNS, "QUARTER": 0.5 * math.pi}
+        texts.append("ripple.c")
+    if terms.friction is not None:
+        share = terms.friction.share_per_step(terms.sample_time_s)
+        numbers |= {"FRICTION_EFFORT": terms.friction.effort, "FRICTION_SHARE": share}
+    return _format_part("What is compensated", numbers, *texts)
+
+
+def _place_terms(terms: Compensation | None) -> dict[str, int]:
+    """Return which reading each term reads, from 1 on, and 0 for none; friction's from 2 on, 1 for the reference."""
+    if terms is None:
+        return {"TERMS": 0}
+    friction, (gravity, ripple) = (
+        terms.friction,
+        (0 if term is None else 1 + terms.reads.index(term.reads) for term in (terms.gravity, terms.ripple)),
+    )
+    rubs = 0 if friction is None else 2 + terms.reads.index(friction.reads) if friction.reads else 1
+    return {"TERMS": 1, "READINGS": len(terms.reads), "GRAVITY": gravity, "RIPPLE": ripple, "FRICTION": rubs}
+
+
+def _format_part(said: str, numbers: Mapping[str, float | Sequence[float]], *texts: str) -> str:
+    """Return what stands before the plan as C: what it is, its numbers, and the texts that laws have."""
+    lines = [
+        f"static const real {name}[] = {{{', '.join(map(_format_number, value))}}};"
+        if isinstance(value, Sequence)
+        else f"static const real {name} = {_format_number(value)};"
+        for name, value in numbers.items()
+    ]
+    return "\n".join([f"/* {said}. */", *lines, "", *map(_read_template, texts)])
 
 
 def _read_template(name: str) -> str:

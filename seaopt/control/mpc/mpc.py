@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from itertools import pairwise
 from typing import Any
@@ -40,6 +40,7 @@ from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.realisation import check_guards
 from seaopt.control.laws.verdict import LimitVerdict, explain_broken, judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
 from seaopt.control.loops.outer_loop import OuterLoop
@@ -59,7 +60,7 @@ from seaopt.control.mpc.quadratic_program import (
     stack_hessian,
 )
 from seaopt.control.mpc.spec import MPCSpec
-from seaopt.control.mpc.step import MPCState, MPCStep, read_references, shape_references
+from seaopt.control.mpc.step import MPCState, MPCStep, add_terms, read_references, shape_references
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
@@ -78,6 +79,7 @@ State = Float[np.ndarray, " n"]  # z of the filter
 PerRow = Float[np.ndarray, " m"]  # of the program
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 LOWEST_SHARE = 7.0  # of the bandwidth asked: down to a seventh of it one that is possible is looked for
+AROUND = ("gate", "heat", "outer", "compensation", "warnings")  # fields of what stands around the plan
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
 
 
@@ -110,6 +112,8 @@ class ForceMPC(ClosesLoops, Result, Worded):
     outer : OuterLoop, optional
         What makes the reference of a stiffness and a damping at the link (`seaopt.control.add_impedance`); its `step`
         comes before this one's.
+    compensation : Compensation, optional
+        What is added to reference and command (`seaopt.control.add_compensation`), whose sum the plan keeps in limits.
     warnings : tuple of str
         What is doubtful, such as a delay that is too short.
     """
@@ -126,12 +130,13 @@ class ForceMPC(ClosesLoops, Result, Worded):
     gate: PlausibilityGate | None = None
     heat: HeatGuard | None = None
     outer: OuterLoop | None = None
+    compensation: Compensation | None = None
     warnings: tuple[str, ...] = ()
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
 
     def __reduce__(self) -> tuple[Any, ...]:
-        parts = self.gate, self.heat, self.outer, self.warnings
-        return _design, (*self.design, self.spec, *parts)  # what it remembers does not pickle
+        around = {name: getattr(self, name) for name in AROUND}
+        return _design, (*self.design, self.spec, around)  # what it remembers does not pickle
 
     @property
     @memo
@@ -274,7 +279,9 @@ class ForceMPC(ClosesLoops, Result, Worded):
             shaped=() if self.spec.low_pass is None else (0.0,) * (self.spec.low_pass.den.size - 1),
         )
 
-    def step(self, state: MPCState, reference_N: float | References, measurement_N: float) -> MPCStep:
+    def step(
+        self, state: MPCState, reference_N: float | References, measurement_N: float, readings: Sequence[float] = ()
+    ) -> MPCStep:
         """Return the current for a reference and a measured force; one that is not finite is predicted.
 
         Parameters
@@ -286,6 +293,8 @@ class ForceMPC(ClosesLoops, Result, Worded):
             the last is held.
         measurement_N : float
             The measured force.
+        readings : sequence of float
+            Of what the compensation, where there is one, reads; where one is not finite, it adds what it did last.
 
         Raises
         ------
@@ -294,6 +303,8 @@ class ForceMPC(ClosesLoops, Result, Worded):
         """
         began = time.perf_counter()
         references, shaped = read_references(reference_N, self.spec.preview_samples), state.shaped
+        terms = add_terms(self.compensation, state.terms, references, readings)
+        references = references + terms[0]
         if self.spec.low_pass is not None:
             references, shaped = shape_references(self.spec.low_pass, shaped, references)
         limit, last, seen = self.command_limit, state.current_A, state.gate
@@ -302,12 +313,16 @@ class ForceMPC(ClosesLoops, Result, Worded):
             _, seen = self.gate.screen(seen, measurement_N)
             measurement_N = np.nan if seen.held else measurement_N
         measurement_N = measurement_N if is_number(measurement_N) else np.nan
+        terms = (terms[0], 0.0, terms[2]) if seen.fault else terms
+        added = terms[1] * self.per_effort  # which the model has no part of, nor of the friction that it meets
         corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
-        drift = float(ahead[-1])
+        drift, before = float(ahead[-1]), last - state.terms[1] * self.per_effort
         u_s, targets = self._targets(drift, references, most)
         xi = ahead[: self.rest_state.size] - self.rest_state * (u_s + drift)
-        q, low, high = self.program(xi, u_s, last, drift, targets, most)
+        q, low, high = self.program(xi, u_s, before, drift, targets, most)
         shifted = self.shift @ state.plan
+        taken = self.prediction.take(added / limit, (added - last + before) / self.spec.slew_per_sample_A)
+        low, high = low - taken, high - taken
         solution = self.solver.solve(q, low, high, state.sides, self.spec.max_iterations)
         theta, status = solution.x, self._fault(solution, low, high)
         planned, age, sides = limit * theta[: shifted.size] + u_s, 0, solution.sides
@@ -319,33 +334,27 @@ class ForceMPC(ClosesLoops, Result, Worded):
         if self.gate is not None and seen.fault:
             status, age, sides = "sensor fault", self.spec.samples, np.zeros_like(sides)
             planned = np.full(shifted.size, self.gate.ramp(last, self.spec.sample_time_s))
-        current = self.admissible(float(planned[0]), last, most)
+        current = self.admissible(float(planned[0]) + added, last, most)
         heat = state.heat if self.heat is None else self.heat.warm(state.heat, current)
-        kalman = self._command(state.kalman, corrected, innovation, current)
+        kalman = self._command(state.kalman, corrected, innovation, current - added)
+        after = replace(state, kalman=kalman, current_A=current, plan=planned, sides=sides, age=age)
         return MPCStep(
             current_A=current,
             solved=not status,
             status=status or solution.status,
             target_N=float(targets[-1]),
             slack=0.0 if status else SLACK_UNIT * float(np.max(theta[shifted.size :], initial=0.0)),
-            state=MPCState(
-                kalman=kalman,
-                current_A=current,
-                plan=planned,
-                sides=sides,
-                age=age,
-                gate=seen,
-                heat=heat,
-                shaped=shaped,
-            ),
+            state=replace(after, gate=seen, heat=heat, shaped=shaped, terms=terms),
             force_N=float(self.kalman.C[0] @ corrected),
             iterations=solution.iterations,
             step_time_s=time.perf_counter() - began,
         )
 
-    def command(self, state: MPCState, reference_N: float | References, measurement_N: float) -> tuple[float, MPCState]:
+    def command(
+        self, state: MPCState, reference_N: float | References, measurement_N: float, readings: Sequence[float] = ()
+    ) -> tuple[float, MPCState]:
         """Return the current and the next state alone, as `close_loop` takes them."""
-        result = self.step(state, reference_N, measurement_N)
+        result = self.step(state, reference_N, measurement_N, readings)
         return result.current_A, result.state
 
     def admissible(self, current_A: float, last_A: float, most_A: float) -> float:
@@ -511,7 +520,7 @@ def force_mpc(
     find_rows(plant, spec.measured)  # refuses a name that is no output
     warnings = warn_delays(spec, plant, params)
     spec, values = settle_delays(spec, plant, params, plans=True)
-    return _design(plant, values, spec, gate, heat, None, warnings)
+    return _design(plant, values, spec, {"gate": gate, "heat": heat, "warnings": warnings})
 
 
 def _find_possible(mpc: ForceMPC) -> float | None:
@@ -527,16 +536,8 @@ def _find_possible(mpc: ForceMPC) -> float | None:
     return find_end(keeps, list_steps(bandwidth_hz, bandwidth_hz / LOWEST_SHARE), bandwidth_hz, bandwidth_hz)
 
 
-def _design(
-    plant: Plant,
-    values: ParameterSet,
-    spec: MPCSpec,
-    gate: PlausibilityGate | None = None,
-    heat: HeatGuard | None = None,
-    outer: OuterLoop | None = None,
-    warnings: tuple[str, ...] = (),
-) -> ForceMPC:
-    """Return the controller of a specification whose delay is settled; friction slides in its model."""
+def _design(plant: Plant, values: ParameterSet, spec: MPCSpec, around: Mapping[str, Any] | None = None) -> ForceMPC:
+    """Return the controller of a settled specification, with fields of `AROUND`; friction slides in its model."""
     design = (plant, values)
     plant = freeze_heat(take_sliding(plant, values))
     completed = plant.complete(ParameterSet(parameter for name, parameter in values.items() if name not in DELAYS))
@@ -593,8 +594,5 @@ def _design(
         rest_state=sampled.rest_state,
         shift=np.column_stack([np.interp(knots + 1, knots, row) for row in np.eye(knots.size)]),
         solver=factor_program(stack_hessian(prediction), prediction.rows),
-        gate=gate,
-        heat=heat,
-        outer=outer,
-        warnings=warnings,
+        **around or {},
     )

@@ -72,6 +72,15 @@ class HorizonProgram:
     # the matrix of all rows, over knots and slacks: knots, slopes, and those of `outputs`
     rows: Float[np.ndarray, "r nv"]
 
+    def take(self, added: float, stepped: float) -> Float[np.ndarray, " r"]:
+        """Return what the ends of the rows lose to what is added to the command, a share of its limit, and to the step
+        that is made of it, a share of the slew limit.
+        """
+        taken = np.zeros(len(self.rows))
+        taken[: self.knots.size] = added
+        taken[self.knots.size : self.knots.size + min(len(self.M), 1)] = stepped
+        return taken
+
 
 def solve_regulator(plant: ForcePlant, rho: float) -> Regulator:
     """Return the linear-quadratic regulator of w xi over the gain, and of the current's increments."""

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from seaopt.control.laws.plausibility import GateState, is_number
+from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import EstimatorState
 from seaopt.errors import ControlError
 from seaopt.plants.motor.heat_guard import COLD
 from seaopt.records import record
+
+Added = tuple[float, float, Memory]
 
 
 @record(eq=False)
@@ -34,6 +39,8 @@ class MPCState:
         Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
     shaped : tuple of float
         What the prefilter, where there is one, keeps.
+    terms : (float, float, (float, float))
+        What a compensation, where there is one, added to the reference and as effort, and what it remembers.
     """
 
     kalman: EstimatorState
@@ -44,6 +51,7 @@ class MPCState:
     gate: GateState = GateState()
     heat: tuple[float, float] = COLD
     shaped: tuple[float, ...] = ()
+    terms: Added = (0.0, 0.0, FORGOTTEN)
 
 
 @record(eq=False)
@@ -82,6 +90,17 @@ class MPCStep:
     slack: float
     iterations: int
     step_time_s: float
+
+
+def add_terms(
+    terms: Compensation | None, last: Added, references: Float[np.ndarray, " p"], readings: Sequence[float]
+) -> Added:
+    """Return what terms add in a sample, and remember; as in the last one where a reading is no number."""
+    if terms is None or not all(map(is_number, readings)):
+        return last
+    reference = float(references[0])
+    shaped, effort, memory = terms.step(last[2], reference, readings)
+    return shaped - reference, effort, memory
 
 
 def shape_references(

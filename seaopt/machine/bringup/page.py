@@ -162,8 +162,10 @@ def _describe_stage(stage: Stage) -> Section:
     controller = stage.controller
     source, code = stage.source, "force_mpc.c" if isinstance(stage.source, ForceMPC) else "force_law.c"
     held = f"Keep {source.over} at {format_number(stage.place)}." if isinstance(source, ScheduledController) else ""
-    begin = "begin with force_mpc_reset" if isinstance(source, ForceMPC) else BEGIN.format(stage.name)
-    ring = "" if isinstance(source, ForceMPC) else f" ({stage.name}/force_law_log.c does)"
+    begin, ring = BEGIN.format(stage.name), f" ({stage.name}/force_law_log.c does)"
+    if isinstance(source, ForceMPC):
+        terms = "" if source.compensation is None else ", call force_mpc_terms before each force_mpc_step"
+        begin, ring = f"begin with force_mpc_reset{terms}", ""
     sentences = [
         *([held] if held else []),
         *([f"{stage.note[0].upper()}{stage.note[1:]}."] if stage.note else []),

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
-from seaopt.control import Controller, ControllerSpec, ForceMPC, MPCSpec, ScheduledController, force_mpc
+from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.machine.acceptance import list_draws
@@ -25,7 +25,7 @@ from seaopt.machine.bringup.expected import (
     split_limits,
 )
 from seaopt.machine.response.verdicts import find_friction
-from seaopt.machine.stepped import Source, stand
+from seaopt.machine.stepped import Source, Spec, change_plan, limit_spec, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
@@ -42,7 +42,6 @@ STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
 OF_A_STAGE = (  # options of predictive control that a stage may have otherwise
     "bandwidth_hz", "min_sensitivity_bandwidth_hz", "current_limit_A", "command_limit", "largest_force_N",
 )  # fmt: skip
-Spec = TypeVar("Spec", ControllerSpec, MPCSpec)
 
 
 @record(eq=False)
@@ -302,20 +301,11 @@ def lower_effort(source: Source, fraction: float) -> Source:
     if limit is None:
         raise ControlError("the command has no limit to lower; give current_limit_A (command_limit)")
     if isinstance(source, ForceMPC):
-        return change_plan(source, replace(_limit(source.spec, fraction * limit), largest_force_N=None))
+        return change_plan(source, replace(limit_spec(source.spec, fraction * limit), largest_force_N=None))
     if isinstance(source, ScheduledController):
-        lower = (replace(each, spec=_limit(each.spec, fraction * limit)) for each in source.controllers)
+        lower = (replace(each, spec=limit_spec(each.spec, fraction * limit)) for each in source.controllers)
         return replace(source, controllers=tuple(lower))
-    return replace(source, spec=_limit(source.spec, fraction * limit))
-
-
-def change_plan(plan: ForceMPC, spec: MPCSpec) -> ForceMPC:
-    """Return predictive control of another specification, with the same guards and outer loop."""
-    return replace(force_mpc(*plan.design, spec, gate=plan.gate, heat=plan.heat), outer=plan.outer)
-
-
-def _limit(spec: Spec, limit: float) -> Spec:
-    return replace(spec, **{"current_limit_A" if spec.current_limit_A is not None else "command_limit": limit})
+    return replace(source, spec=limit_spec(source.spec, fraction * limit))
 
 
 def _find_stage(

@@ -242,17 +242,18 @@ class _PlantRun:
         the reference of, an x_0 or a force, and asks for the force of one sample: with it there is no preview.
         """
         mpc, rig = self.mpc, self.rig
-        outer = mpc.outer
-        moved = outer is not None and outer.position in rig.plant.outputs
+        outer, reads = mpc.outer, () if mpc.compensation is None else mpc.compensation.reads
+        named = (*reads, *(() if outer is None else (outer.position,)))
+        moved = tuple(dict.fromkeys(name for name in named if name in rig.plant.outputs))
 
         def law(state: Any, r: Any, y: Any) -> tuple[float, Any]:
-            plan, kept = state
+            (plan, kept), (force, *positions) = state, np.ravel(y).tolist()
+            places = dict(zip(moved, positions, strict=True))
             if outer is not None:
-                y, position = y if moved else (y, 0.0)
-                x_0, force = outer.split(r / outer.per_given)
-                kept = follow_link(outer.numbers, kept, x_0, float(position))
-                r = force + kept[-1]
-            steps.append(mpc.step(plan, r, float(y)))
+                x_0, besides = outer.split(r / outer.per_given)
+                kept = follow_link(outer.numbers, kept, x_0, places.get(outer.position, 0.0))
+                r = besides + kept[-1]
+            steps.append(mpc.step(plan, r, force, [places.get(name, 0.0) for name in reads]))
             return steps[-1].current_A, (steps[-1].state, kept)
 
         return close_loop(
@@ -261,7 +262,7 @@ class _PlantRun:
             rig.plant,
             self.values,
             self.drawn.reference,
-            measured=(mpc.measured, outer.position) if outer is not None and moved else mpc.measured,
+            measured=(mpc.measured, *moved),
             sample_time_s=mpc.sample_time_s,
             delay_samples=mpc.compute_delay_samples,
             preview_samples=mpc.spec.preview_samples if outer is None else 0,

@@ -22,7 +22,8 @@ from seaopt.control.tuning.tuner import RobustTo
 def linear_controller(mpc: ForceMPC) -> Controller:
     """Return a predictive controller's law while no limit is active, as a controller with the same limits of its loop.
 
-    It has no limit of the command: what the plan does with one is no part of it.
+    It has no limit of the command: what the plan does with one is no part of it. What stands around the plan does
+    around it.
 
     Examples
     --------
@@ -33,7 +34,8 @@ def linear_controller(mpc: ForceMPC) -> Controller:
     >>> controller.structure, controller.feasible
     ('custom', True)
     """
-    return replace(assess(_split_law(mpc), *mpc.design, linear_spec(mpc.spec)), outer=mpc.outer)
+    law = assess(_split_law(mpc), *mpc.design, linear_spec(mpc.spec))
+    return replace(law, outer=mpc.outer, compensation=mpc.compensation)
 
 
 def _split_law(mpc: ForceMPC) -> Law:

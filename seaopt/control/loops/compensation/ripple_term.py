@@ -114,6 +114,12 @@ class RippleTerm:
         """Revolutions per unit of the reading, and the coefficients."""
         return [1.0 / self.period, *self.cos, *self.sin]
 
+    @property
+    def harmonics(self) -> list[tuple[float, float]]:
+        """Cosine and sine of every harmonic from the first to the last, as the C sums them."""
+        series = {n: (cos, sin) for n, cos, sin in zip(self.cycles, self.cos, self.sin, strict=True)}
+        return [series.get(n, (0.0, 0.0)) for n in range(1, max(self.cycles) + 1)]
+
     def effort(self, position: float) -> float:
         """Return what is added to the effort at a position."""
         return float(sum_ripple(self.cycles, self.numbers, position, np))

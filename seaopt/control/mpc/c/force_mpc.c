@@ -45,6 +45,36 @@ static real shape(real *state, real reference) {
 
 static real clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
 
+#if FORCE_MPC_TERMS
+static real limited(real x, real most) { return clip(x, -most, most); }
+#include "terms.h"
+
+void force_mpc_terms(force_mpc *s, real reference, const real *readings) {
+  int used = is_number(reference);
+  for (int i = 0; i < FORCE_MPC_READINGS; i++) used = used && is_number(readings[i]);
+  (void)readings;
+  if (!used) return;
+  real effort = 0;
+#if FORCE_MPC_GRAVITY
+  s->weight = weight_at(readings[FORCE_MPC_GRAVITY - 1]);
+#endif
+#if FORCE_MPC_RIPPLE
+  effort += ripple_at(readings[FORCE_MPC_RIPPLE - 1]);
+#endif
+#if FORCE_MPC_FRICTION
+#if FORCE_MPC_FRICTION > 1
+  real now = readings[FORCE_MPC_FRICTION - 2];
+#else
+  real now = reference;
+#endif
+  if (s->differenced) effort += FRICTION_EFFORT * limited(FRICTION_SHARE * (now - s->before), 1);
+  s->before = now;
+  s->differenced = 1;
+#endif
+  s->added = mpc_per_effort * effort;
+}
+#endif
+
 /* The limit of the command at this sample. */
 static real limit_of(const force_mpc *s) {
 #if FORCE_MPC_HEAT
@@ -100,17 +130,17 @@ static void admissible_rest(real limit, real drift, real *low, real *high) {
   (void)drift;
 }
 
-/* Limits of all rows. */
-static void limit_rows(const force_mpc *s, const real *error, real rest, real drift, real *low,
+/* Limits of all rows; `added`: to the command that is planned. */
+static void limit_rows(const force_mpc *s, const real *error, real rest, real drift, real added, real *low,
                        real *high) {
   real share = limit_of(s) / mpc_limit;
   for (int i = 0; i < KNOTS; i++) {
-    low[i] = -share - rest / mpc_limit;
-    high[i] = share - rest / mpc_limit;
+    low[i] = -share - rest / mpc_limit - added / mpc_limit;
+    high[i] = share - rest / mpc_limit - added / mpc_limit;
   }
 #if FORCE_MPC_SLEWS
   for (int i = KNOTS; i < LIMITS; i++) {
-    real start = i == KNOTS ? (s->command - rest) / mpc_slew : 0;
+    real start = i == KNOTS ? (s->command - added - rest) / mpc_slew : 0;
     low[i] = start - 1;
     high[i] = start + 1;
   }
@@ -132,14 +162,14 @@ static void limit_rows(const force_mpc *s, const real *error, real rest, real dr
 }
 
 /* Put the solution into `plan` if it can be used; return whether it can. */
-static int solve(force_mpc *s, real *plan, const real *error, const real *delta, real rest, real drift) {
+static int solve(force_mpc *s, real *plan, const real *error, const real *delta, real rest, real drift, real added) {
   real q[VARIABLES], low[ROWS], high[ROWS], theta[VARIABLES];
   for (int i = 0; i < VARIABLES; i++) q[i] = i < KNOTS ? dot(mpc_F[i], error, PLANT + 1) : mpc_penalty;
 #if KNOWN
   for (int i = 0; i < KNOTS; i++) q[i] += dot(mpc_R[i], delta, KNOWN);
 #endif
   (void)delta;
-  limit_rows(s, error, rest, drift, low, high);
+  limit_rows(s, error, rest, drift, added, low, high);
   force_mpc_ending ending = force_mpc_minimise(&s->program, q, low, high, theta);
   s->iterations = s->program.iterations;
   if (ending == FORCE_MPC_INFEASIBLE) return 0;
@@ -203,7 +233,14 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   if (!(s->limit < (double)mpc_limit)) s->limit = (double)mpc_limit;
 #endif
   admissible_rest(limit_of(s), drift, &least, &most);
-  real last = s->reference, rest = 0;
+  real last = s->reference, rest = 0, weight = 0, added = 0;
+#if FORCE_MPC_TERMS
+  weight = s->weight;
+  added = s->added;
+#endif
+#if FORCE_MPC_GATE
+  if (s->refused > FORCE_MPC_MAX_HELD) added = 0;
+#endif
 #if FORCE_MPC_PREFILTER
   real shaped[FORCE_MPC_PREFILTER];
   memcpy(shaped, s->shaped, sizeof shaped);
@@ -211,9 +248,9 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   for (int i = 0; i <= PREVIEW; i++) {
     if (i < count && is_number(references[i])) last = references[i];
     if (i == 0) s->reference = last;
-    real asked = last;
+    real asked = last + weight;
 #if FORCE_MPC_PREFILTER
-    asked = shape(shaped, last);
+    asked = shape(shaped, asked);
     if (i == 0) memcpy(s->shaped, shaped, sizeof shaped);
 #endif
     rest = clip(asked / mpc_static_gain - drift, least, most);
@@ -225,10 +262,10 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
     delta[j] = at[0] - target[PREVIEW] + mpc_lag * (at[1] - at[0]);
   }
   for (int i = 0; i < PLANT; i++) error[i] = ahead[i] - mpc_rest[i] * (rest + drift);
-  error[PLANT] = s->command - rest;
+  error[PLANT] = s->past[DELAY] - rest; /* the last that was planned */
 
   for (int i = 0; i < KNOTS; i++) plan[i] = dot(mpc_shift[i], s->plan, KNOTS);
-  s->solved = solve(s, plan, error, delta, rest, drift);
+  s->solved = solve(s, plan, error, delta, rest, drift, added);
   if (!s->solved && s->age >= FORCE_MPC_HORIZON)
     for (int i = 0; i < KNOTS; i++) plan[i] = rest; /* else the last plan goes on */
   s->age = s->solved ? 0 : s->age < FORCE_MPC_HORIZON ? s->age + 1 : FORCE_MPC_HORIZON;
@@ -243,7 +280,7 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   }
 #endif
   memcpy(s->plan, plan, sizeof s->plan);
-  real command = plan[0];
+  real command = plan[0] + added;
 #if FORCE_MPC_SLEWS
   command = clip(command, s->command - mpc_slew, s->command + mpc_slew);
 #endif
@@ -251,7 +288,7 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
 #if FORCE_MPC_HEAT
   warm(&s->rise_winding, &s->rise_case, (double)s->command);
 #endif
-  s->past[DELAY + 1] = s->command;
+  s->past[DELAY + 1] = s->command - added;
   advance(s->z, s->past[0], s->past[1]);
   memmove(s->past, s->past + 1, (DELAY + 1) * sizeof *s->past);
   return s->command;

@@ -27,6 +27,11 @@ typedef struct {
   force_mpc_real outer_state, outer_last; /* what is taken off the link's next difference, the last reference asked */
   int outer_known;
 #endif
+#if FORCE_MPC_TERMS
+  force_mpc_real weight, added;   /* to the references, to the command */
+  force_mpc_real before;          /* what was differenced last */
+  int differenced;                /* whether there was one */
+#endif
 #if FORCE_MPC_PREFILTER
   force_mpc_real shaped[FORCE_MPC_PREFILTER]; /* what the low-pass of the reference keeps */
 #endif
@@ -55,6 +60,13 @@ force_mpc_real force_mpc_step(force_mpc *s, force_mpc_real reference, force_mpc_
  * is, in m or rad, read in the same sample as the measurement. Where either is no number the last one stands. Without
  * stiffness the first does nothing: a force that is asked for besides is added to what this returns. */
 force_mpc_real force_mpc_outer(force_mpc *s, force_mpc_real reference, force_mpc_real position);
+#endif
+
+#if FORCE_MPC_TERMS
+/* Once a sample, before force_mpc_step: what is compensated, by the reference (with an outer loop what that returned) and
+ * FORCE_MPC_READINGS readings, FORCE_MPC_READ in this order, taken in the same sample as the measurement. The step adds the
+ * weight to all of its references and the rest to its command, within limits. Where one is no number all stays as it was. */
+void force_mpc_terms(force_mpc *s, force_mpc_real reference, const force_mpc_real *readings);
 #endif
 
 /* The same with references known ahead: `count` of them, of this sample and of those that follow, the last of which is
