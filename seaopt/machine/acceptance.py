@@ -30,7 +30,7 @@ from seaopt.machine.response.enclosed import enclose_outer, enclose_ticks
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
 from seaopt.machine.response.reported import Reported, read_status
 from seaopt.machine.response.tripped import Trip, find_refused, find_trip
-from seaopt.machine.response.verdicts import Response, find_noise_share, has_dry_friction, judge_response
+from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand, stands_still
 from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference_unit, take_ticks
 from seaopt.parameters import ParameterSet
@@ -44,11 +44,6 @@ EXPLAINED = 0.95  # of the difference, from which on another rate is what the fi
 FEWER_TICKS = (
     "a machine with dry friction is compared with its model by simulation under the reference of every tick, which a "
     "log of every n-th has not"
-)
-DITHERED = 0.7  # of the command's rms, that noise makes: more than the reference does
-NOISY = (
-    "the noise of what the law reads moves the command more than the reference does: it shakes the motor through its "
-    "dry friction, which the model, simulated without noise, does not; play a larger amplitude"
 )
 OUTER_LOOP = (
     "an outer loop was closed around the law, so that the link and what touches it are in the response; give the plant "
@@ -330,9 +325,6 @@ def accept(
     whole = [ticks for ticks in rows if ticks.source not in left_out]
     if has_dry_friction(law) and any(row.ticks_per_row > 1 for row in replays):
         left_out["differences"] = FEWER_TICKS
-        return replace(result, response=response, left_out=left_out)
-    if has_dry_friction(law) and any(find_noise_share(law, ticks) > DITHERED for ticks in whole):
-        left_out["differences"] = NOISY
         return replace(result, response=response, left_out=left_out)
     draws = list_draws(law, uncertainty, ranges, DRAWS, SEED)
     differences = compare(law, response.measured, whole, draws, confidence, apart)

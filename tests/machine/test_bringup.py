@@ -251,7 +251,8 @@ def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_wh
 
 
 def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(compiler, tmp_path):
-    """Played on the simulator in C, with its own noise: no tick is at the limit, which would cost its period."""
+    """Played on the simulator in C, with its own noise: no tick is at the limit, which would cost its period, and the
+    machine is told from one with twice the friction."""
     knee = so.plants.rotary(link="locked")
     values = knee.complete(so.ParameterSet()).update(
         N=60, K_tau=0.06, eta=0.75, J_m=5e-5, b_r=1e-4, f_c=0.01, v_s=1.0, k_s=180.0
@@ -270,14 +271,15 @@ def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(compiler
     )  # fmt: skip
     stage = plan.stages[0]
     assert "beside which the noise of what it reads has no room" in stage.note and stage.certificate.met
-    log = Bench(compiler, tmp_path, stage.controller).log(
-        Machine.of_knee(values), stage.excitation.reference, noise=0.05
-    )
+    bench, reference = Bench(compiler, tmp_path, stage.controller), stage.excitation.reference
+    log = bench.log(Machine.of_knee(values), reference, noise=0.05)
     assert np.max(np.abs(log["I"])) < stage.controller.command_limit < 15.0
-    result = so.accept(stage.controller, [log])
-    assert result.replayed and result.response is not None
     # The noise shakes the motor through its friction: compared without it, v_s was 1.8 times what it is.
-    assert result.differences is None and "play a larger amplitude" in result.left_out["differences"]
+    result = so.accept(stage.controller, [log])
+    assert result.replayed and result.differences.inside
+    rubbing = bench.log(Machine.of_knee(values.update(f_c=0.02)), reference, noise=0.05)
+    found = so.accept(stage.controller, [rubbing]).differences.found[0]
+    assert "f_c" in (found.name, *found.alike) and found.explains > 0.95
     assert len(plan.stages) == 2
     (tmp_path / "full").mkdir()
     full = Bench(compiler, tmp_path / "full", law).log(

@@ -112,6 +112,7 @@ def run_loop(
     start: LoopState | None = None,
     external: Mapping[str, Float[np.ndarray, " n"]] | None = None,
     seed: int = 0,
+    noise_gain: float | Float[np.ndarray, " runs"] = 1.0,
     start_s: float = 0.0,
     rtol: float | None = None,
     standing: float | Float[np.ndarray, "..."] = 0.0,
@@ -133,6 +134,8 @@ def run_loop(
         The plant's other inputs, such as Fe2, held between samples; zero where left out.
     seed : int
         Of the sensor noise, the same in every run: what differs between runs is the parameters.
+    noise_gain : float or array, shape (runs,)
+        By which that noise is multiplied in each run.
     start_s : float
         Time of the first sample.
     rtol : float, optional
@@ -172,7 +175,7 @@ def run_loop(
     if wanted.ndim != 2 or wanted.shape[0] not in (1, runs) or not wanted.shape[1]:
         raise SimulationError(f"reference has the shape {reference.shape}; give (n,) or ({runs}, n)")
     n = wanted.shape[1]
-    noise = _noise(loop, values, n, seed, standing)
+    noise = _noise(loop, values, n, seed, noise_gain, standing)
     if isinstance(loop.law, RunnableSchedule):
         noise = np.dstack([noise, np.broadcast_to(0.0 if loop.place in loop.plant.states else places, (runs, n))])
     job = Job(
@@ -278,6 +281,7 @@ def _noise(
     params: Sequence[CompletedParameters],
     n: int,
     seed: int,
+    gain: float | Float[np.ndarray, " runs"],
     standing: float | Float[np.ndarray, "..."],
 ) -> Float[np.ndarray, "runs n y"]:
     """Return the noise of every reading, that of further ones drawn after the first; where a held link stands too."""
@@ -289,6 +293,7 @@ def _noise(
         return loop.sensors.combine_errors(loop.plant, values, name)[0]
 
     std = np.array([[find_std(values, name) for name in loop.signals] for values in params])
+    std = std * np.reshape(gain, (-1, 1))
     noise = np.zeros((len(params), n, len(loop.signals)))
     places = np.reshape(standing, (-1, 1)) if np.ndim(standing) < 2 else standing
     for name, position in zip(loop.standing, np.broadcast_to(places, (len(params), len(loop.standing))).T, strict=True):

@@ -1,7 +1,10 @@
 """The measured plant and a model of it, as one vector of lines.
 
 With dry friction the model's response is that of the same law on the nonlinear plant, simulated under the logged
-reference and cut as the log is, since it depends on amplitude; two periods of each set of phases do, without noise.
+reference and cut as the log is, since it depends on amplitude; two periods of each set of phases do. Noise of what the
+law reads, which is in its command, shakes the motor through its friction: where it makes much of the command the model
+has as much of it, twice, once turned about zero. In the mean of both what noise adds to the lines is gone, and what it
+makes of friction is left.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.bench import Sensors
 from seaopt.control import Controller, sample
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import LogError
@@ -21,7 +25,7 @@ from seaopt.machine.differences.few_periods import find_most_noise, find_widenin
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.judged import Measured
 from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
-from seaopt.machine.response.verdicts import has_dry_friction
+from seaopt.machine.response.verdicts import find_noise_share, has_dry_friction, measure_noise
 from seaopt.machine.ticks import Ticks
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -29,6 +33,7 @@ from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
 TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
+SHAKES = 0.3  # of the command's rms, from which on noise is simulated, too
 Lines = Complex[np.ndarray, " m"]
 
 
@@ -116,8 +121,23 @@ class Comparison:
         source, share = replace(self.controller, outer=None), 1.0  # what was given is the force law's reference
         if self.apart is not None and self.apart.outer is not None:
             source, share = replace(self.apart, design=source.design), 1.0 / self.apart.outer.per_given
-        runs = [run_design(source, sets, share * ticks.reference, rate=self.rate) for ticks in self.logs]
-        return [self._cut([run.outputs for run in runs], k) for k in range(len(sets))]
+        runs = [self._run(source, sets, share, ticks) for ticks in self.logs]
+        return [self._cut(runs, k) for k in range(len(sets))]
+
+    def _run(
+        self, source: Controller, sets: Sequence[ParameterSet], share: float, ticks: Ticks
+    ) -> Mapping[str, Float[np.ndarray, "runs n"]]:
+        """Return the outputs of runs under a share of a log's reference, with the noise of its readings where that
+        shakes the motor.
+        """
+        reference = share * ticks.reference
+        if find_noise_share(self.controller, ticks) < SHAKES:
+            return run_design(source, sets, reference, rate=self.rate).outputs
+        noise = dict(zip(self.controller.signals, measure_noise(ticks), strict=True))
+        sensors = Sensors(noise_std={name: std for name, std in noise.items() if name in source.signals})
+        gains = np.repeat([1.0, -1.0], len(sets))
+        both = run_design(source, [*sets, *sets], reference, sensors=sensors, noise_gain=gains, rate=self.rate)
+        return {name: rows.reshape(2, len(sets), -1).mean(axis=0) for name, rows in both.outputs.items()}
 
     def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> list[Blocks]:
         """Return the periods of the k-th of some runs, but those in which the logged command is at its limit."""

@@ -142,12 +142,16 @@ def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
     }
 
 
+def measure_noise(ticks: Ticks) -> Float[np.ndarray, " y"]:
+    """Return the std of the noise of each signal that is read, taken as white."""
+    return np.array([measure_white(reading[np.isfinite(reading)]) for reading in ticks.measured.T])
+
+
 def find_noise_share(controller: Controller, ticks: Ticks) -> float:
-    """Return the share of the command's rms that the noise of what is read makes, taken as white."""
+    """Return the share of the command's rms that the noise of what is read makes."""
     f = np.linspace(0.0, 0.5 / controller.sample_time_s, GRID + 2)[1:-1]
-    std = np.array([measure_white(reading[np.isfinite(reading)]) for reading in ticks.measured.T])
     power = np.mean(np.abs(controller.law.responses(f)[1:]) ** 2, axis=1)
-    noise = abs(controller.per_effort) * float(np.sqrt(std**2 @ power))
+    noise = abs(controller.per_effort) * float(np.sqrt(measure_noise(ticks) ** 2 @ power))
     return noise / max(float(np.nanstd(ticks.command)), 1e-300)
 
 
