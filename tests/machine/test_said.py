@@ -44,6 +44,7 @@ def test_up_to_which_command_the_log_judges_is_data_and_said(judged, tmp_path):
             27.1,
             "it is 27.1 Hz (24.4 to 29.8), which is less than was asked and no less than the 27 Hz that are allowed",
         ),
+        (46.0, "1.5 times what was asked: nothing bounds it above"),
         (66.0, "2.2 times what was asked"),
     ],
 )

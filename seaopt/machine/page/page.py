@@ -42,7 +42,6 @@ PARTS = {
     "provenance": "Provenance",
 }
 MOST_CAUSES = 5
-TWICE = 2.0  # times the bandwidth that was asked, above which it is no longer that
 LITTLE = 0.5  # of it, below which the limit of a stuck machine says little
 NO_GAINS = (
     "The law has no gains with names (it is one's own, or predictive control): a part that is left out, or a gain "
@@ -131,7 +130,7 @@ def _say_reached(row: Judged, asked: float) -> str:
     said = f"{format_number(value, 3)} Hz ({show_interval(row)})"
     if value < allowed:
         return said + SHORT
-    if value > TWICE * asked:
+    if value > (1.0 + SHORT_BY) * asked:
         return said + FASTER.format(format_number(value / asked, 2))
     less = row.high is not None and row.high < asked
     return said + (ALLOWED.format(f"{format_number(allowed, 3)} Hz", f"{100.0 * SHORT_BY:g} %") if less else REACHES)
