@@ -285,7 +285,7 @@ def has_friction(plant: Plant, params: ParameterSet, varied: Collection[str] = (
     flattest, steepest = friction_slopes(plant, values)
     holds = bool(np.any(flattest != steepest)) or any(find_bristle_stiffness(plant, values))
     waves = any(values[size].value for reading in plant.followed.values() for size in reading.sizes)
-    return holds or waves or bool(_friction_parameters(plant) & set(varied))
+    return holds or waves or bool(list_friction_parameters(plant) & set(varied))
 
 
 def find_bristle_stiffness(plant: Plant, params: ParameterSet) -> list[float]:
@@ -316,8 +316,8 @@ def _take_viscous(friction: Friction, slope: Callable[[Any], Any]) -> Friction:
 
 
 @memo
-def _friction_parameters(plant: Plant) -> frozenset[str]:
-    """Return the parameters on which the difference of the slopes depends."""
+def list_friction_parameters(plant: Plant) -> frozenset[str]:
+    """Return the parameters on which dry friction depends, by the difference of its slopes."""
     p = name_parameters(plant, plant.p)
     bounds = [bound_slopes(friction, p) for friction in plant.friction.values()]
     spans = [ca.SX(steepest - flattest) for flattest, steepest in bounds]

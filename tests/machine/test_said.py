@@ -10,7 +10,9 @@ import pytest
 
 import seaopt as so
 from seaopt.machine.differences.size_fit import Difference
+from seaopt.machine.page.verdict import judge
 from seaopt.machine.wording import say_difference
+from seaopt.reporting.sections.data import Commands
 from tests.machine.simulator import Machine
 from tests.machine.test_left_out import read_everywhere
 from tests.machine.test_response import REFERENCE
@@ -60,6 +62,26 @@ def test_a_stuck_bandwidth_is_said_beside_what_was_asked(judged, value, says, li
     text = " ".join(repr(replace(result, response=replace(result.response, judged=tuple(rows)))).split())
     assert says in text
     assert ("The limit of 5.4 Hz is 18 % of what was asked" in text) == little
+
+
+@pytest.mark.parametrize(
+    ("name", "says", "never"),
+    [
+        ("f_c", "record a larger amplitude, beside which dry friction is less", "1382"),
+        ("k", "record 1382 periods", "is less"),
+    ],
+)
+def test_no_periods_are_asked_for_where_friction_is_what_differs(judged, name, says, never):
+    _, result = judged
+    rows = [
+        replace(row, outcome="undecided", periods=1382) if row.name == "bandwidth" else row
+        for row in result.response.judged
+    ]
+    made = {"kind": "parameter", "unit": "-", "explains": 1.0, "low": 1.9, "high": 2.1, "value": 2.0}
+    differences = replace(result.differences, inside=False, found=(Difference(name=name, **made),))
+    other = replace(result, response=replace(result.response, judged=tuple(rows)), differences=differences)
+    (reason,) = [each.what for each in judge(other, Commands()).reasons if "does not decide" in each.what]
+    assert f"bandwidth: {says}" in reason and never not in reason
 
 
 def test_a_factor_at_the_end_of_what_is_tried_is_said_to_be_that_or_more():

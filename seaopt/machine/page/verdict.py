@@ -8,6 +8,7 @@ from seaopt.machine.differences.certified import Differences
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.verdicts import LEAST_PHASES, Judged, Response
 from seaopt.machine.wording import say_cause, say_difference, say_missing, say_status, say_trip
+from seaopt.plants.friction import list_friction_parameters
 from seaopt.reporting.sections.data import Commands, Reason, Step, Style, Verdict
 from seaopt.units import unit_after
 
@@ -19,6 +20,10 @@ PARTLY = "which explains {} of the difference: more than that differs, and its s
 NO_UNIT = (
     "the column of the reference states no unit: write [{}] in its header if it is x_0, which the outer loop was "
     "given, or [{}] if it is what the law was given, and judge again"
+)
+LARGER = (
+    "a larger amplitude, beside which dry friction is less: it is another one than in the model, which more periods do "
+    "not change (or fit it again with this log, and tune)"
 )
 UNCERTIFIED = {
     "missing": "not certified: there is no certificate of this law",
@@ -117,12 +122,24 @@ def say_undecided(result: Acceptance, response: Response) -> str:
     if response.needs_lines is not None:
         record.append(say_missing(response.needs_lines, response.missing))
     periods = 0 if tripped or refuted else max((row.periods or 0 for row in rows), default=0)
-    if periods:
+    if rows and not tripped and _rubs(result):
+        record.append(LARGER)
+    elif periods:
         record.append(f"{periods} periods in all ({format_number(periods * response.period_s, 3)} s)")
     wanted = join_words(record) or ("again" if refuted else "more periods, or a larger reference")
     first = "mend what is refuted first, then " if refuted else ""
     others = [f"{join_words([name_figure(row) for row in rows])}: {first}record {wanted}"] if rows else []
     return "; ".join([*others, *near])
+
+
+def _rubs(result: Acceptance) -> bool:
+    """Tell whether dry friction is named as what differs."""
+    found = () if result.differences is None else result.differences.found[:1]
+    design = result.controller.design
+    if not found or design is None:
+        return False
+    parts = (found[0], *found[0].beside)
+    return bool({name for part in parts for name in (part.name, *part.alike)} & list_friction_parameters(design[0]))
 
 
 def _say_near(row: Judged) -> str:
