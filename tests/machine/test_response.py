@@ -70,6 +70,20 @@ def test_margins_are_those_of_the_equations(controller, bench):
         assert np.isclose(rows[name].predicted, value, rtol=0.05)
 
 
+def test_a_margin_whose_interval_would_say_nothing_is_not_told_and_what_tells_it_is_said(controller, bench):
+    """Once as many periods are recorded as it says, the margin of the equations is told."""
+    noise, short = 8.0, REFERENCE[: 4 * 1000]
+    result = so.accept(controller, [bench.log(Machine(), short, noise=noise)])
+    row = next(row for row in result.response.judged if row.name == "gain margin")
+    assert row.low is None and row.high is None and row.periods > result.response.measured[0].periods
+    text = " ".join(str(result).split())
+    assert "does not tell the gain margin" in text and f"{row.periods} periods in all" in text
+    long = np.tile(REFERENCE[:1000], row.periods + 1)
+    after = so.accept(controller, [bench.log(Machine(), long, noise=noise, seed=2)])
+    told = next(row for row in after.response.judged if row.name == "gain margin")
+    assert told.low is not None and told.low > 0.0
+
+
 def run_at(bench, machine, rate):
     """Return the log of a machine whose law is stepped at another rate, with the time that its firmware believes."""
     run = bench.log(machine, REFERENCE, noise=0.5, period=1e-3 / rate)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +16,9 @@ from seaopt.machine.page.figures import list_panels
 from seaopt.machine.page.verdict import OUTCOMES, judge, name_figure, say_inside, say_undecided, show_interval
 from seaopt.machine.reference_offset import Offset
 from seaopt.machine.replay import Replay
+from seaopt.machine.response.measured_margins import MARGINS
 from seaopt.machine.response.periods import say_left_out
-from seaopt.machine.response.verdicts import SHORT_BY, Judged, Measured, Response, compares_amplitudes
+from seaopt.machine.response.verdicts import HOUR, SHORT_BY, Judged, Measured, Response, compares_amplitudes
 from seaopt.machine.ticks import AT_LIMIT, Gaps
 from seaopt.machine.wording import say_bias, say_cause, say_difference, say_status, say_trip
 from seaopt.reporting.page.chart import make_chart
@@ -50,6 +52,10 @@ NO_GAINS = (
 ENCLOSED = (
     "The loop is the whole one, with the outer loop in it, on the plant of its link, broken at the command: that is "
     "what was certified there. Of how it tracks a force nothing is asked."
+)
+NO_MARGIN = (
+    "The log does not tell the {}: its interval would be nearly as wide as the margin itself. {} decides; lines that "
+    "lie closer about it help, too."
 )
 ONE_BY_ONE = "Each line by itself is within reach of some such machine, but none of them explains all lines together."
 RATE = (
@@ -136,6 +142,15 @@ def _say_reached(row: Judged, asked: float) -> str:
     return said + (ALLOWED.format(f"{format_number(allowed, 3)} Hz", f"{100.0 * SHORT_BY:g} %") if less else REACHES)
 
 
+def _say_no_margin(row: Judged, response: Response) -> str:
+    """Return that a margin is not told, and what would tell it."""
+    larger = f"larger reference near {format_number(row.where_hz, 3)} Hz"
+    lasts = math.inf if row.periods is None else row.periods * response.period_s
+    if lasts > HOUR:
+        return NO_MARGIN.format(row.name, f"A {larger}")
+    return NO_MARGIN.format(row.name, f"{row.periods} periods in all ({format_number(lasts, 3)} s) or a {larger}")
+
+
 def describe(result: Acceptance) -> list[Section]:
     """Return what was compared, what may be the cause where it differs, and what the response says."""
     sections = _describe_replay(result)
@@ -183,6 +198,7 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     remarks += explain_sliding(result.controller)
     remarks += [_say_stuck(row, result.controller) for row in response.judged if row.state == "stuck"]
     remarks += [_say_as_played(row, result) for row in response.judged if row.state == "as played"]
+    remarks += [_say_no_margin(row, response) for row in response.judged if row.name in MARGINS and not row.told]
     if response.still:
         unit = unit_after(result.controller.command.effort_unit)
         sizes = (f"{format_number(value, 3)}{unit}" for value in (response.effort, response.friction))

@@ -154,6 +154,8 @@ def _say_near(row: Judged) -> str:
 
 def show_interval(row: Judged) -> str:
     """Return the interval of a figure."""
+    if not row.told:
+        return "not told"
     return f"{format_number(row.low, 3, 'none')} to {format_number(row.high, 3, 'none')}"
 
 

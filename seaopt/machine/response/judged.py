@@ -28,12 +28,17 @@ class Judged:
     unit: str
     outcome: Outcome
     where_hz: float | None  # the line that decides, or is the nearest to deciding
-    periods: int | None  # in all, that would decide where it is undecided
+    periods: int | None  # in all, that would decide where it is undecided, or tell a margin that has no interval
     predicted: float | None = None  # of the design plant
     # Of the machine whose limit and prediction these are, by dry friction: "stuck", or "as played", which is that of
     # the certified machines under the reference that was played.
     state: str = ""
     near: float | None = None  # where those periods last over an hour: the estimate's distance from the limit, relative
+
+    @property
+    def told(self) -> bool:
+        """Whether it has an interval."""
+        return self.low is not None or self.high is not None
 
 
 @record
