@@ -322,10 +322,11 @@ def plan_bring_up(
         return tuned.controller if isinstance(tuned, JointTuning) else tuned
 
     def certify_stage(law: Source) -> Certificate:
-        problem = session.problem if law is controller else _stand_still(session.problem, law)
+        full = law is controller  # as `seaopt certify` does; the stages before are motions of the law alone
+        problem = session.problem if full else _stand_still(session.problem, law)
         if isinstance(law, ForceMPC):
-            return certify_problem(replace(problem, mpc=law.spec), linear_controller(law), source, thorough=False)
-        return certify_problem(problem, law, source, large_signals=False, thorough=False)
+            return certify_problem(replace(problem, mpc=law.spec), linear_controller(law), source, thorough=full)
+        return certify_problem(problem, law, source, large_signals=full, thorough=full)
 
     session.warn_of_design(session.problem.certified_plants().values())
     target = folder / BRING_UP

@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 import seaopt as so
 from seaopt.cli.main import app
 from seaopt.control import ScheduledController
+from seaopt.files import to_json
+from seaopt.problem import certify_problem
 from seaopt.problem.stages import design_mpc
 from tests.machine.simulator import Bench, Machine
 
@@ -126,3 +128,20 @@ def test_predictive_control_is_brought_up_slower_and_its_stage_accepted(tmp_path
         assert content["replay"]["met"] and content["response"] is not None, content["replay"]
     seaopt("accept", log)  # of the slower stage, under the full law
     assert not json.loads((tmp_path / "out" / "acceptance.json").read_text())["replay"]["met"]
+
+
+def test_a_full_law_without_a_certificate_is_certified_as_the_command_does_it(tmp_path, seaopt, monkeypatch):
+    made = []
+
+    def record(*arguments, **options):
+        made.append(certify_problem(*arguments, **options))
+        return made[-1]
+
+    monkeypatch.setattr("seaopt.cli.machine.certify_problem", record)
+    (tmp_path / "stand.toml").write_text(SCHEDULED[: SCHEDULED.index("schedule =")])
+    assert seaopt("tune").exit_code == 0 and seaopt("bringup", "--limit", "F1=900").exit_code == 0
+    assert seaopt("certify").exit_code == 0
+    certified = json.loads((tmp_path / "out" / "robustness.json").read_text())
+    full = json.loads(to_json(made[-1].to_dict()))
+    assert full["simulation"]["large_signal"]
+    assert all(full[part] == certified[part] for part in ("requirements", "plants", "simulation"))
