@@ -44,8 +44,8 @@ def count_parts(samples: int, run_up: int = 0) -> int:
 
 
 def guess_run_up(samples: int) -> int:
-    """Return a first run-up: an eighth of a part, of which every thread has as many as lanes."""
-    return samples // (8 * count_parts(samples))
+    """Return a first run-up: the longest for which there is room. One that is too short costs the pass."""
+    return int(SHARE * samples) // count_parts(samples)
 
 
 def find_run_up(sensitivities: Float[np.ndarray, "parts nx nx"], samples: int, *, least: int = 0) -> int:
