@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from functools import wraps
 from importlib import import_module
 from operator import attrgetter
+from reprlib import recursive_repr
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform, overload
 
 from seaopt.errors import KeywordError, TruthValueError, UnknownAttributeError, suggestion
@@ -35,15 +36,40 @@ def record(cls: type[Any] | None = None, /, *, eq: bool = True, repr: bool = Tru
     where fields are arrays or symbols. `repr`: of all fields; False where the class prints itself. `keywords`: answer
     an unknown keyword with the nearest field, for what users write: it costs a microsecond per call.
     """
-    decorate = dataclass(frozen=True, slots=True, kw_only=True, eq=eq, repr=repr)
+    decorate = dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 
     def make(plain: type[Any]) -> type[Any]:
         made = decorate(plain)
+        methods = {**(_compare_by_value(made) if eq else {}), **({"__repr__": _name_fields} if repr else {})}
+        for name in methods.keys() - made.__dict__.keys():
+            setattr(made, name, methods[name])
         if any("option" in each.metadata for each in fields(made)):
             made.__doc__ = document_options(made)
         return _explain_keywords(made) if keywords else made
 
     return make if cls is None else make(cls)
+
+
+def _compare_by_value(cls: type[Any]) -> dict[str, Any]:
+    """Return what makes two of a class equal where their fields are. A dataclass does the same by code that it compiles
+    for each class, which takes a tenth of the time in which a first command loads.
+    """
+    names = [each.name for each in fields(cls) if each.compare]
+    values = attrgetter(*names, "__class__")  # two names at least make it a tuple
+
+    def compare(self: Any, other: object) -> bool:
+        return values(self) == values(other) if other.__class__ is self.__class__ else NotImplemented
+
+    def hash_values(self: Any) -> int:
+        return hash(values(self))
+
+    return {"__eq__": compare, "__hash__": hash_values}
+
+
+@recursive_repr()
+def _name_fields(self: Any) -> str:
+    named = (f"{each.name}={getattr(self, each.name)!r}" for each in fields(self) if each.repr)
+    return f"{type(self).__qualname__}({', '.join(named)})"
 
 
 def _explain_keywords(cls: type[Any]) -> type[Any]:
