@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -477,8 +478,13 @@ def find_offset(
 
 def list_steps(ticks: Ticks) -> Float[np.ndarray, " k"]:
     """Return the steps that reference and readings are rounded to; none of a reference of steps."""
-    first = find_quantisation(ticks.reference) if _is_rounded(ticks.reference) else 0.0
-    return np.array([first, *map(find_quantisation, ticks.measured.T)])
+    return np.array(_list_steps(ticks.reference.tobytes(), *(column.tobytes() for column in ticks.measured.T)))
+
+
+@lru_cache(maxsize=4)  # dozens of laws are played on one log
+def _list_steps(*contents: bytes) -> list[float]:
+    reference, *measured = map(np.frombuffer, contents)
+    return [find_quantisation(reference) if _is_rounded(reference) else 0.0, *map(find_quantisation, measured)]
 
 
 def _is_rounded(reference: Float[np.ndarray, " n"]) -> bool:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from seaopt.control import Controller
 from seaopt.errors import LogError
+from seaopt.estimation.problem.correlation import find_quick_size
 from seaopt.formatting import format_count, join_words
 from seaopt.logs.quality.faults import find_runs
 from seaopt.machine.response.runaway import say_runaway
@@ -103,13 +105,20 @@ class Blocks:
 
 def find_period(reference: Float[np.ndarray, " n"]) -> int | None:
     """Return the period of a reference in rows; None where it does not repeat."""
+    return _find_period(np.asarray(reference, dtype=float).tobytes())
+
+
+@lru_cache(maxsize=4)  # each model of a machine is played the same reference
+def _find_period(content: bytes) -> int | None:
+    reference = np.frombuffer(content)
     if reference.size < 2 * SHORTEST:
         return None
     moving = np.diff(reference)  # in which a bias that fades in is small
     moving = np.nan_to_num(moving - np.nanmean(moving))
     size, n = _span(reference), moving.size
-    spectrum = np.abs(np.fft.rfft(moving, 2 * n)) ** 2
-    total = np.fft.irfft(spectrum)[: n // 2 + 3]  # differences are one fewer: half of the rows is a lag inside
+    lags = n // 2 + 3  # differences are one fewer: half of the rows is a lag inside
+    long = find_quick_size(n + lags)
+    total = np.fft.irfft(np.abs(np.fft.rfft(moving, long)) ** 2, long)[:lags]
     if total[0] <= (STEADY * size) ** 2 * n:
         return None
     like = total * n / (total[0] * (n - np.arange(total.size)))  # as many rows at every lag
