@@ -6,6 +6,10 @@ shows another start, for the duty is at its limit in half of the log. The given 
 truth, so that a minimum further away from which the residual is not the sensors' noise is in doubt. Starts around the
 given values, each a factor of two up or down and the next with all ways turned, are settled roughly, until one leaves
 noise; the best goes on.
+
+Where joints stick a short log has other minima near by: with a delay some milliseconds off, a joint that was thrown in
+place of one at rest. They leave hundreds of times a sensor's noise. The starts are then at rest, and are settled with
+the given delay first: of logs of 8 s of a knee with two encoders 5 of 12 were found, and are all with it.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.noise_floor import measure_excess
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.solver.least_squares import Callback, name_phase
@@ -21,6 +26,7 @@ from seaopt.estimation.solver.settle import Solved, settle, settle_roughly
 
 FAR = 10.0  # times its given value, from which one has strayed
 NOISE = 1.5  # times a sensor's own, that a residual is at most where nothing is wrong
+LOST = 100.0  # times a sensor's own: what a search that ended near by leaves where joints stick
 OFF, STARTS = 2.0, 12  # times the given values, and how many starts
 
 
@@ -30,15 +36,22 @@ def search_around(solved: Solved, seed: int, max_iterations: int, callback: Call
     """
     problem, z = solved.problem, solved.solution.z
     unknowns, count = problem.unknowns, problem.unknowns.shared
-    if problem.all_linear or not _has_strayed(solved) or _leaves_noise(solved):
+    lost = any(e.model.sticks for e in problem.experiments) and _measure_most(solved) > LOST
+    if problem.all_linear or not (lost or _has_strayed(solved)) or _leaves_noise(solved):
         return solved
     callback, rng, best = name_phase(callback, "another start"), np.random.default_rng(seed), solved
-    ways = np.ones(count)
-    for number in range(STARTS):
-        ways = -ways if number % 2 else rng.choice([-1.0, 1.0], count)
-        start = z.copy()
+    held = _hold_delays(problem) if lost else problem
+    ways, tried = np.ones(count), set[tuple[float, ...]]()
+    while len(tried) < min(STARTS, 2**count):
+        ways = -ways if len(tried) % 2 else rng.choice([-1.0, 1.0], count)
+        if tuple(ways) in tried:
+            continue
+        tried.add(tuple(ways))
+        start = unknowns.start.copy() if lost else z.copy()
         start[:count] = unknowns.start[:count] * OFF**ways
-        rough = settle_roughly(problem, problem.evaluate(np.clip(start, unknowns.low, unknowns.high)), callback)
+        rough = settle_roughly(held, held.evaluate(np.clip(start, unknowns.low, unknowns.high)), callback)
+        if lost:
+            rough = settle_roughly(problem, problem.evaluate(rough.solution.z), callback)
         best = min(best, rough, key=lambda each: each.misfit)
         if best is rough and _leaves_noise(rough):
             break
@@ -49,6 +62,13 @@ def search_around(solved: Solved, seed: int, max_iterations: int, callback: Call
     iterations = solved.solution.iterations + other.solution.iterations
     other = replace(other, solution=replace(other.solution, iterations=iterations))
     return min(solved, other, key=lambda each: each.misfit)
+
+
+def _hold_delays(problem: FitProblem) -> FitProblem:
+    """Return the problem with its delays at their given values."""
+    unknowns = problem.unknowns
+    places = [e.slots.delay.index for e in problem.experiments if e.slots.delay.index is not None]
+    return replace(problem, unknowns=unknowns.bound(places, unknowns.start[places], unknowns.start[places]))
 
 
 def _has_strayed(solved: Solved) -> bool:
@@ -63,4 +83,9 @@ def _has_strayed(solved: Solved) -> bool:
 
 
 def _leaves_noise(solved: Solved) -> bool:
-    return all(excess <= NOISE for excess in measure_excess(solved.problem, solved.solution.z).values())
+    return _measure_most(solved) <= NOISE
+
+
+def _measure_most(solved: Solved) -> float:
+    """Return how many times its sensor's noise a residual is at most."""
+    return max(measure_excess(solved.problem, solved.solution.z).values())
