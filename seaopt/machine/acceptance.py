@@ -32,7 +32,7 @@ from seaopt.machine.response.reported import Reported, read_status
 from seaopt.machine.response.tripped import Trip, find_refused, find_trip
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand, stands_still
-from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference_unit, take_ticks
+from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference, take_ticks
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import Result, Worded, record
@@ -251,10 +251,11 @@ def accept(
     if ranges and controller.design is not None:
         plants = {"design plant": controller.design[0]} | ({} if link is None else {"link": link[0]})
         check_ranges(ranges, plants)
-    rows, replays = list[Ticks](), list[Replay]()
+    rows, replays, law = list[Ticks](), list[Replay](), stand(controller, at)
     for log, ticks in zip(logs, list_ticks(controller, logs, reference, at), strict=True):
-        tried, outer = [(ticks, replay(controller, ticks, others))], stand(controller, at).outer
-        unclear = outer is not None and outer.stiffness and find_reference_unit(log, reference) in ("", "-")
+        tried, outer = [(ticks, replay(controller, ticks, others))], law.outer
+        given = find_reference(log, reference)
+        unclear = outer is not None and outer.stiffness and given is not None and given.unit in ("", "-")
         may_be_outer = outer is not None and outer.position in log.signals and (unclear or not outer.stiffness)
         if not tried[0][1].met and may_be_outer:
             with suppress(LogError):  # the position has gaps
@@ -265,7 +266,7 @@ def accept(
         if chosen.gaps is not None and chosen.rendered is None and row.met and row.ticks_per_row == 1:
             (whole,) = list_ticks(controller, [log], reference, at, whole=True)
             row = replay_stretches(controller, row, chosen, whole, others or {})
-        row = _check_header(controller, log, row, others or {})
+        row = _check_header(controller, log, _check_column(law, log, row, reference), others or {})
         if row.met and row.ticks_per_row == 1:
             row = replace(row, trip=find_trip(stand(controller, chosen.middle), chosen))
         rows.append(chosen)
@@ -359,6 +360,21 @@ def _find_plant(law: Controller, ticks: Ticks, link: tuple[Plant, ParameterSet] 
 def _end_at_trip(ticks: Ticks, trip: Trip | None) -> Ticks:
     """Return the ticks before the readings of which the law's gate made a fault."""
     return ticks if trip is None else ticks.take(slice(0, trip.row))
+
+
+def _check_column(law: Controller, log: Log, row: Replay, reference: str | None) -> Replay:
+    """Return a replay with the signal whose column was read as the reference, too, where it is not met."""
+    given = find_reference(log, reference)
+    if row.met or given is None or not given.origin.column:
+        return row
+    source = given.origin.file, given.origin.column
+    names = [name for name in (law.command.input, *law.signals) if name in log.signals and name != given.name]
+    for name in names:
+        origin = log.signal(name).origin
+        if (origin.file, origin.column) == source:
+            cause = Cause(kind="column", what=name, value=None, unit="", removes=1.0, explains=True)
+            return replace(row, causes=(cause, *row.causes))
+    return row
 
 
 def _check_header(source: Source, log: Log, row: Replay, others: Others) -> Replay:

@@ -17,7 +17,7 @@ from seaopt.formatting import join_words
 from seaopt.logs import Log
 from seaopt.logs.quality.faults import find_quantisation, find_rails, find_runs, measure_stillness
 from seaopt.records import record
-from seaopt.signals import REFERENCES
+from seaopt.signals import REFERENCES, Signal
 
 AT_LIMIT = 1.0 - 1e-6  # of the command's limit, from which on it is there
 FORGETS = 35.0  # time constants in which nothing is left of a start
@@ -142,8 +142,8 @@ def take_ticks(
     command, names = controller.command, (*controller.signals, *controller.further)
     called = [reference] if reference is not None else [name for name in REFERENCES if name in log.signals]
     around = controller.outer if controller.renders or before else None
-    given = find_reference_unit(log, reference)
-    if around is not None and not before and given not in (None, around.place_unit):
+    given = find_reference(log, reference)
+    if around is not None and not before and given is not None and given.unit != around.place_unit:
         around = None  # the force law's own reference, whatever it comes from
     if around is not None:
         names = tuple(dict.fromkeys((*names, around.position)))
@@ -196,10 +196,10 @@ def take_ticks(
     return ticks if around is None else _render(ticks, around, table[:, 2 + names.index(around.position)])
 
 
-def find_reference_unit(log: Log, reference: str | None) -> str | None:
-    """Return the unit that a log's reference states; None where there is no such channel."""
+def find_reference(log: Log, reference: str | None) -> Signal | None:
+    """Return the reference of a log; None where there is no such channel."""
     names = [name for name in ((reference,) if reference is not None else REFERENCES) if name in log.signals]
-    return log.signal(names[0]).unit if names else None
+    return log.signal(names[0]) if names else None
 
 
 def _take_beside(controller: Controller, log: Log, rows: Any, whole: bool) -> dict[str, Float[np.ndarray, " n"]]:

@@ -99,6 +99,11 @@ def say_cause(cause: Cause) -> str:
             return f"the {cause.what} is missing"
         case "gains":
             return _say_gains(cause)
+        case "column":
+            return (
+                f"the column of the reference is that of {cause.what}: name the one of what the law was given "
+                "(--reference COLUMN, or [acceptance] in the problem file)"
+            )
         case "stopped":
             return (
                 f"it is this law until the command was stopped, which is zero from {value} s on: a gate that tripped, "

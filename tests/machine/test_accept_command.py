@@ -290,3 +290,12 @@ def test_a_schedule_is_accepted_at_the_value_that_is_typed(compiler, tmp_path):
     )
     assert done.exit_code == 0, done.output
     assert json.loads((tmp_path / "out" / "acceptance.json").read_text())["place"]["over"] == "k"
+
+
+def test_a_reference_that_is_the_column_of_the_command_leads(folder, accept):
+    done = accept(folder / "bare.csv", "--reference", "I")
+    text = " ".join(done.output.split())
+    assert done.exit_code == 1 and "another set of gains" not in text.partition("Replay")[0]
+    (log,) = json.loads((folder / "out" / "acceptance.json").read_text())["replay"]["logs"]
+    assert (log["causes"][0]["kind"], log["causes"][0]["what"]) == ("column", "I")
+    assert "the column of the reference is that of I" in text.partition("Replay")[0]
