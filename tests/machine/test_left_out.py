@@ -139,7 +139,7 @@ def test_periods_with_a_gap_are_counted_and_all_others_used(controller, bench, r
     terminal, page, record = read_everywhere(so.accept(controller, [lose(whole, rows)]), tmp_path)
     (part,) = record["response"]["measured"]
     assert part["left_out"] == {"limit": 0, "gate": 0, "gap": lost} and part["periods"] == 9 - lost
-    says = f"{lost} of them miss a row or a number"
+    says = f"in {lost} of them a row or a number is missing"
     assert says in terminal and says in page
     gaps, says = record["replay"]["logs"][0]["gaps"], f"bench has no row of {len(rows)} tick"
     assert (gaps["ticks"], gaps["rows"]) == (len(rows), 0)
@@ -178,7 +178,7 @@ def test_a_log_with_a_gap_in_each_period_says_so_and_how_many(controller, bench,
         so.accept(controller, [log], played=Played(period_s=1.0, lasts_s=12.0)), tmp_path
     )
     assert record["response"] is None and "whole periods of 1 s" in record["left_out"]["bench"]
-    assert "shorter than" not in record["left_out"]["bench"] and "9 of them miss a row" in record["left_out"]["bench"]
+    assert "shorter than" not in record["left_out"]["bench"] and "in 9 of them a row" in record["left_out"]["bench"]
     assert record["replay"]["logs"][0]["gaps"]["ticks"] == rows.size
     assert f"no row of {rows.size} ticks" in terminal and f"no row of {rows.size} ticks" in page
 

@@ -22,8 +22,8 @@ NO_UNIT = (
     "given, or [{}] if it is what the law was given, and judge again"
 )
 LARGER = (
-    "a larger amplitude, beside which dry friction is less: it is another one than in the model, which more periods do "
-    "not change (or fit it again with this log, and tune)"
+    "a larger amplitude, beside which dry friction is less (it is another one than in the model, which more periods do "
+    "not change; or fit again with this log, and tune)"
 )
 UNCERTIFIED = {
     "missing": "not certified: there is no certificate of this law",
@@ -43,7 +43,7 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     reasons += [
         Reason(what=say_status(each, row), where=source) for source, each, row in reported if each and each.contradicts
     ]
-    response, differences = result.response, result.differences
+    response, differences, undecided = result.response, result.differences, list[Reason]()
     if response is not None:
         limited = [row for row in response.judged if row.limit is not None]
         counts = {outcome: sum(row.outcome == outcome for row in limited) for outcome in OUTCOMES}
@@ -52,11 +52,12 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
             parts.append("dry friction held the motor, so that they are of the stuck machine alone")
         reasons += [Reason(what=_say_refuted(row)) for row in limited if row.outcome == "refuted"]
         if counts["undecided"]:
-            reasons.append(Reason(what=f"the log does not decide {say_undecided(result, response)}"))
+            undecided = [Reason(what=f"the log does not decide {say_undecided(result, response)}")]
     if differences is not None and not differences.inside:
         parts.append(say_inside(result, differences))
         first = response is not None and response.rate != 1.0  # by which all figures are other ones
         reasons.insert(0 if first else len(reasons), Reason(what=_say_best(differences)))
+    reasons += undecided  # what differs may be why
     if result.stepped is not None:
         reasons.append(Reason(what=say_difference(result.stepped)))
     if result.certificate in UNCERTIFIED:

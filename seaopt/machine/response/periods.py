@@ -201,7 +201,7 @@ def say_left_out(left_out: LeftOut) -> list[str]:
     counts = (
         (left_out.limit, "in {} of them the command is at its limit: lower the amplitude, or allow a larger limit"),
         (left_out.gate, "in {} of them the gate did not believe a reading: look at its range and its largest step"),
-        (left_out.gap, "{} of them miss a row or a number, or lie beyond such a gap: log every tick"),
+        (left_out.gap, "in {} of them a row or a number is missing, or they lie beyond such a gap: log every tick"),
     )
     return [text.format(count) for count, text in counts if count]
 
