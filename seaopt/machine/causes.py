@@ -53,15 +53,8 @@ REFINES = 3  # replays that a factor of a schedule's command takes
 MOST_ROWS = 50_000  # about the largest mismatch, on which edits of a table are tried: the variable has to move in them
 ASKED = "the outer loop's output"
 SHORT = {"gain": "short, gain", "factor": "short, factor", "late": "short, late"}  # more periods would tell these
-ROWS = (
-    "terms",
-    "outer",
-    "moving",
-    "periods",
-    "saturated",
-    "phases",
-    "aliases",
-)  # why a log of every n-th tick tells nothing
+# Why a log of every n-th tick tells nothing.
+ROWS = ("terms", "outer", "moving", "periods", "saturated", "phases", "aliases")
 UNDECIDED = ("rounding", *SHORT.values(), *ROWS)
 
 
@@ -102,6 +95,7 @@ class Cause:
     sigmas: float | None = None  # stds of rounding, over the whole log, of what no single tick shows
     besides: bool = False  # it is so beside the first cause, and removes what it does together with that
     edited: Edited | None = None  # of a gain, or gains, in a schedule's table
+    tells_hz: float | None = None  # of a law that the log does not tell: where a line of the reference would
 
     @property
     def undecided(self) -> bool:

@@ -18,7 +18,8 @@ of a command that is as good as the same, :math:`a = \Phi^T d/\Phi^T\Phi` is the
 - It is *confirmed* where in each case another share than one is sure: of a gain of half its size, of a reference,
   reading or command that is halved, of a tick's delay. Of laws with a part left out, or made for another rate, it says
   which are not excluded: few references tell all of them.
-- Else the log cannot tell. The std falls with the root of the periods, which says how many would do.
+- Else the log cannot tell. The std falls with the root of the periods, which says how many would do; and at another
+  line the loop of the model makes more of the other law, which says where to play one.
 
 A law under an outer loop with a stiffness is one law with it, of x_0, the readings and the link's position. Without a
 stiffness the link's place drifts, and has no lines.
@@ -47,6 +48,7 @@ from seaopt.machine.response.periods import Blocks, cut_periods
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction
 from seaopt.machine.stepped import Others, Setting, keep_over, stand, stands_still
 from seaopt.machine.ticks import Ticks, find_saturated
+from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
 MOST = 20  # ticks per row
@@ -59,6 +61,9 @@ FITTED = 4.0  # of the misfit, that a size that is fitted has to take away more 
 MATTERS = 0.02  # of the law's response: what changes less of it at any frequency is the same law
 GRID = np.geomspace(1e-5, 0.45, 200)  # of the law's rate, where that is looked at
 SMALL = 1e-9  # of the largest singular value
+SPAN = (0.1, 0.45)  # of the lowest line, and of the log's rate, between which a line that would tell is looked for
+FINER = 200  # times the lines of a period that such ones lie closer
+PLENTY = 2.0  # times what a share needs at least to be sure, that such a line tells
 
 Parts = Complex[np.ndarray, "b m"]  # a row per period, or per set of phases, at the lines
 Lines = Complex[np.ndarray, " m"]  # their means over the reference
@@ -311,6 +316,34 @@ class Table:
         return float(np.sum(found.scale(self.average(chosen)) ** 2)) <= found.most
 
 
+def find_telling(table: Table, found: Off, others: Others, place: float) -> list[float | None]:
+    """Return of each shift, and each command that is logged otherwise late, the frequency at which a line as strong as
+    the others would tell it, by the loop of the design plant: the nearest to those that were played; None of it where
+    none would.
+    """
+    controller, blocks = table.controller, table.blocks
+    if controller.design is None or table.outer is not None:
+        return []
+    plant, values = controller.design
+    rows, period_s = FINER * blocks.rows, FINER * blocks.period_s
+    edges = SPAN[0] * blocks.f[0], SPAN[1] * blocks.rows / blocks.period_s
+    f = np.unique(np.round(np.geomspace(*edges, GRID.size) * period_s)) / period_s
+    reads, law = controller.plant(take_sliding(plant, values), values).responses(f), controller.law.responses(f)
+    effort = law[0] / (1.0 - np.sum(law[1:] * reads, axis=0))
+    played = replace(
+        blocks, f=f, rows=rows, period_s=period_s, reference=np.ones((1, f.size), dtype=complex), effort=effort[None],
+        measured=(reads * effort)[None], beside={},
+    )  # fmt: skip
+    there = replace(table, blocks=played, made=effort[None])
+    std = np.hypot(np.median(found.noise), OFF * np.abs(effort))
+    away = np.maximum(np.log(blocks.f[0] / f), np.log(f / blocks.f[-1]))
+    told = list[float | None]()
+    for shift in (*there.list_shifts(others, place), *there.list_late(found.late)):
+        sure = np.flatnonzero(np.abs(shift.commands[0]) >= PLENTY * found.sigmas * std)
+        told.append(float(f[sure[np.argmin(away[sure])]]) if sure.size else None)
+    return told
+
+
 def count_ticks_per_row(controller: Controller, ticks: Ticks) -> int:
     """Return how many ticks of a law a row of its log takes by its clock; 1 where that is no whole number."""
     ratio = 1.0 / (controller.sample_time_s * ticks.rate_hz)
@@ -358,7 +391,8 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
             elif table.is_alias(found):
                 causes = (leave_open("aliases", "reference"),)
     else:
-        causes = list_untold(found, every, vectors, blocks.period_s * len(blocks.reference))
+        tells_hz = find_telling(table, found, others, place) or [None] * len(every)
+        causes = list_untold(found, every, vectors, tells_hz, blocks.period_s * len(blocks.reference))
         possible = list_possible(found, shifts, table)
     size = np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0)) * abs(controller.command.per_effort)
     allowed = float(np.sqrt(np.sum((found.std * size) ** 2)))
@@ -406,12 +440,14 @@ def is_off(found: Off, shifts: Sequence[Shift], means: Sequence[Lines]) -> bool:
     return found.misfit > found.most or any(abs(share) > found.sigmas * std for share, std in towards)
 
 
-def list_untold(found: Off, shifts: Sequence[Shift], means: Sequence[Lines], seconds: float) -> tuple[Cause, ...]:
+def list_untold(
+    found: Off, shifts: Sequence[Shift], means: Sequence[Lines], tells_hz: Sequence[float | None], seconds: float
+) -> tuple[Cause, ...]:
     """Return what the log does not exclude beside the law, with the seconds of it that would, the longest first; none
-    where no length would. `seconds`: of the log's periods.
+    where no length would. `tells_hz`: where a line would tell each; `seconds`: of the log's periods.
     """
     untold: list[Cause] = []
-    for shift, mean in zip(shifts, means, strict=True):
+    for shift, mean, hertz in zip(shifts, means, tells_hz, strict=True):
         if shift.role != "excluded" or found.excludes(mean):
             continue
         needed, (_, std) = math.inf, found.fit(mean)
@@ -421,7 +457,7 @@ def list_untold(found: Off, shifts: Sequence[Shift], means: Sequence[Lines], sec
             least = (0.5 / found.sigmas) ** 2 - std**2 * (1.0 - part)
             needed = max(std**2 * part / least, 1.0) if least > 0.0 else math.inf
         value = seconds * needed if math.isfinite(needed) else None
-        untold.append(leave_open(SHORT[shift.kind], shift.what, value, "s"))
+        untold.append(replace(leave_open(SHORT[shift.kind], shift.what, value, "s"), tells_hz=hertz))
     return tuple(sorted(untold, key=lambda cause: -(cause.value or math.inf)))
 
 

@@ -46,11 +46,12 @@ def _say_open(cause: Cause) -> str:
         value = format_number(cause.value)
         return f"undecided: rounding of the log allows {value} (rms) of the command; log it with more digits"
     other = UNTOLD[cause.kind].format("reading" if cause.what == "readings" else cause.what)
-    more = (
-        "no length of this reference would decide: play lines where that acts, or log every tick"
-        if cause.value is None
-        else f"{format_number(cause.value, 2)} s of this reference would decide"
-    )
+    seconds = "no length" if cause.value is None else f"{format_number(cause.value, 2)} s"
+    more = f"{seconds} of this reference would decide"
+    if cause.tells_hz is not None:
+        more += f"; play a line at {format_number(cause.tells_hz, 2)} Hz in it, too, or log every tick"
+    elif cause.value is None:
+        more += "; play lines where that acts, or log every tick"
     return f"undecided: the log cannot tell this law from {other}; {more}"
 
 

@@ -11,6 +11,7 @@ import seaopt as so
 from seaopt.control import Gains, runnable
 from seaopt.machine.bringup.excitation import design_excitation
 from seaopt.machine.stepped import find_modes, find_steady
+from seaopt.machine.wording import say_cause
 from tests.machine.conftest import SPEC
 from tests.machine.simulator import Bench, Machine, multisine
 
@@ -350,6 +351,22 @@ def test_the_seconds_that_would_decide_do(controller, bench):
     periods = int(row.causes[0].value) + 2
     longer = keep_every(bench.log(Machine(), multisine(1000, SLOW, periods, 20.0, 1, bias=300.0)), 10)
     assert periods < 300 and so.accept(controller, [longer]).replayed
+
+
+@pytest.mark.parametrize(("lines", "what"), [(np.arange(60, 90, 2), "k_i"), (np.arange(1, 7), "command")])
+def test_the_lines_that_would_tell_this_law_from_another_do(controller, bench, halved, lines, what):
+    """Of lines where the other law acts little no length would do; with those that are named all is told."""
+
+    def play(bench, lines, scale):
+        return keep_every(bench.log(Machine(), multisine(2000, lines, 8, scale, 1, bias=300.0)), 2)
+
+    (row,) = so.accept(controller, [play(bench, 2 * lines, 60.0)]).replays
+    cause = next(cause for cause in row.causes if cause.what == what)
+    assert row.undecided and f"play a line at {cause.tells_hz:.2g} Hz" in say_cause(cause)
+    more = np.unique([*(2 * lines), *(round(2 * each.tells_hz) for each in row.causes if each.tells_hz)])
+    scale = 60.0 * np.sqrt(more.size / lines.size)
+    assert so.accept(controller, [play(bench, more, scale)]).replayed
+    assert not any(so.accept(controller, [play(each, more, scale)]).replayed for each in halved.values())
 
 
 @pytest.mark.parametrize(
