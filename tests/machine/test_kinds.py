@@ -23,9 +23,11 @@ from seaopt.control.loops.compensation.terms import Compensation, GravityTerm
 from seaopt.control.running.law_step import run_law
 from seaopt.formatting import format_number
 from seaopt.machine.design_run import run_design
+from seaopt.machine.page.verdict import judge
 from seaopt.machine.stepped import Setting, limit_law
 from seaopt.machine.ticks import Ticks
 from seaopt.machine.wording import say_cause
+from seaopt.reporting.sections.data import Commands
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES, REFERENCE, respond
 
@@ -120,6 +122,17 @@ def test_a_factor_is_not_taken_for_another_place(schedule, scheduled, factor, de
     columns = {"reference": log["reference"], "F1": log["F1"], "I": factor * log["I"], "k": 6.2e5 + wave}
     (row,) = so.accept(schedule, [so.Log.from_arrays(time=log.time, **columns)]).replays
     assert not row.met and row.causes[0].what == "I" and row.causes[0].value == pytest.approx(factor, abs=2e-3), row
+
+
+def test_a_factor_that_coarse_digits_do_not_tell_from_another_place_is_named_beside_it(schedule, scheduled):
+    places = 6.2e5 + 1e5 * np.sin(2e-3 * np.arange(REFERENCE.size))
+    log = scheduled.log(SOFT, REFERENCE, places=places, decimals=2)
+    columns = {"reference": log["reference"], "F1": log["F1"], "I": 1.01 * log["I"], "k": places}
+    result = so.accept(schedule, [so.Log.from_arrays(time=log.time, **columns)])
+    (reason,) = (each.what for each in judge(result, Commands()).reasons if "should be" in each.what)
+    said = re.search(r"I is ([\d.]+) times what it should be", reason)
+    assert said and float(said[1]) == pytest.approx(1.01, abs=2e-3) and "the log does not tell them apart" in reason
+    assert "the law was given k with" in reason and "added to what was logged" in reason
 
 
 def replace_place(log, places):

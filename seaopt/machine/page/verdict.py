@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import EXPLAINED, Acceptance
+from seaopt.machine.causes import Cause
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.verdicts import LEAST_PHASES, Judged, Response
@@ -21,6 +22,8 @@ NO_UNIT = (
     "the column of the reference states no unit: write [{}] in its header if it is x_0, which the outer loop was "
     "given, or [{}] if it is what the law was given, and judge again"
 )
+SIZED = {"factor", "gain", "place", "shift"}  # kinds of causes with a size that is fitted
+UNTOLD = "the log does not tell them apart; log it with more digits"
 LARGER = (
     "a larger amplitude, beside which dry friction is less (it is another one than in the model, which more periods do "
     "not change; or fit again with this log, and tune)"
@@ -167,10 +170,21 @@ def _say_mismatch(row: Replay, result: Acceptance) -> str:
     return f"{NO_UNIT.format(outer.place_unit, result.controller.command.reference_unit)}; {said}"
 
 
+def _is_untold(first: Cause, other: Cause) -> bool:
+    """Tell whether a cause may be in place of the first: both leave nothing but rounding, each with a size of another
+    signal that is fitted.
+    """
+    return other.explains and not other.besides and {first.kind, other.kind} <= SIZED and other.what != first.what
+
+
 def _say_off(row: Replay, result: Acceptance) -> str:
     unit = unit_after(result.controller.command.unit)
-    if row.undecided or (row.causes and row.causes[0].explains):
+    if row.undecided:
         return say_cause(row.causes[0])
+    if row.explained:
+        first, *others = row.causes
+        untold = [say_cause(first), *(say_cause(other) for other in others if _is_untold(first, other))]
+        return say_cause(first) if len(untold) == 1 else f"{'; or '.join(untold)}: {UNTOLD}"
     off = f"the command is off by {format_number(row.mismatch, 3)}{unit} (rms), of {format_number(row.rms, 3)}{unit}"
     if row.ticks_per_row > 1:
         off = f"{off}, or lines of the reference lie above half of the log's rate"
