@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -155,12 +155,18 @@ def _show(
 
 def _find_played(folder: Path, stage: str | None, path: Path) -> Played | None:
     """Return how long the reference of a stage is, by the bring-up of a folder; None where it has no such stage."""
-    planned = (each["reference"] for each in _list_planned(folder, path) if each["name"] == (stage or FULL))
+    planned = (each for each in _list_planned(folder, path) if each["name"] == (stage or FULL))
     plan = next(planned, None)
     if plan is None:
         return None
-    periods = plan["periods"] * plan["phases"] + 2  # one that fades in, and one that fades out
-    return Played(period_s=plan["period_s"], lasts_s=periods * plan["period_s"])
+    outer = plan.get("outer")  # of the outer loop, where that has a reference
+    return _count_seconds(plan["reference"], outer=None if outer is None else _count_seconds(outer["reference"]))
+
+
+def _count_seconds(reference: Mapping[str, Any], outer: Played | None = None) -> Played:
+    """Return how long a planned reference is."""
+    periods = reference["periods"] * reference["phases"] + 2  # one that fades in, and one that fades out
+    return Played(period_s=reference["period_s"], lasts_s=periods * reference["period_s"], outer=outer)
 
 
 def _list_planned(folder: Path, path: Path) -> list[dict[str, Any]]:

@@ -262,7 +262,8 @@ def accept(
                 (before,) = list_ticks(controller, [log], reference, at, before=True)
                 tried.append((before, replay(controller, before, others)))
         chosen, row = max(tried, key=lambda pair: (pair[1].met, pair[1].explained, pair[1].undecided))
-        row = replace(row, unit_missing=bool(unclear) and not row.met and not row.explained)
+        unit_missing = bool(unclear) and not row.met and not row.explained
+        row = replace(row, unit_missing=unit_missing, begins=chosen.begins)
         if chosen.gaps is not None and chosen.rendered is None and row.met and row.ticks_per_row == 1:
             (whole,) = list_ticks(controller, [log], reference, at, whole=True)
             row = replay_stretches(controller, row, chosen, whole, others or {})
@@ -305,6 +306,7 @@ def accept(
         law = enclose_outer(apart, link if place is None else (link[0], place_variable(*link, place[0], place[1])))
         rows, result = [enclose_ticks(law, ticks) for ticks in rows], replace(result, enclosed=True)
     judge = partial(judge_response, tracks=apart is None)
+    planned = played if apart is None or played is None else played.outer
     for ticks, row in zip(rows, replays, strict=True):
         try:
             if ticks.rendered is not None:
@@ -312,7 +314,7 @@ def accept(
             if len(ticks) < FEWEST:
                 raise LogError(TRIPPED)
             refused = find_refused(law, ticks) if row.ticks_per_row == 1 else None
-            cut = cut_periods(law, ticks if place is None else require_still(controller, ticks), refused, played)
+            cut = cut_periods(law, ticks if place is None else require_still(controller, ticks), refused, planned)
             blocks.append(shift_command(law, cut, row.command_late) if row.ticks_per_row > 1 else cut)
         except LogError as error:
             left_out[ticks.source] = str(error) if row.trip is None else TRIPPED

@@ -51,6 +51,7 @@ class Replay:
     stretches: int = 1  # between its gaps
     trip: Trip | None = None  # of the law's gate: what comes after it is no longer of the law
     offset: Offset | None = None  # of the reference that the law was given, within half of the step it is logged in
+    begins: int = 0  # as in `Ticks`: rows at the start that are left out
     unit_missing: bool = False  # of the reference, which may be the law's own or that of its outer loop
 
     @property

@@ -55,6 +55,7 @@ class Ticks:
     beside: Mapping[str, Float[np.ndarray, " n"]] = field(default_factory=dict[str, Any])  # outputs it does not read
     left_out: int = 0  # rows of the log that are not in it
     gaps: Gaps | None = None  # of the log; None where it has none
+    begins: int = 0  # rows ahead of them, in which an outer loop's filter forgets what was before the log
 
     def __len__(self) -> int:
         return self.command.size
@@ -248,7 +249,8 @@ def _render(ticks: Ticks, outer: OuterLoop, position: Float[np.ndarray, " n"]) -
     parts = {"stiffness" if outer.stiffness else "force": asked - damping, "damping": damping}
     first = min(math.ceil(FORGETS / -math.log(outer.pole)) if outer.pole else 1, len(ticks) - FEWEST)
     given = np.column_stack([outer.per_given * ticks.reference, position])
-    return replace(ticks, reference=asked, rendered=parts, given=given).take(slice(max(first, 1), None))
+    begins = max(first, 1)
+    return replace(ticks, reference=asked, rendered=parts, given=given, begins=begins).take(slice(begins, None))
 
 
 def _find_longest(log: Log, whole: Any) -> slice:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 import seaopt as so
 from seaopt.formatting import format_number
 from seaopt.machine.bringup.files import write_bring_up
-from tests.machine.conftest import KNEE
+from seaopt.machine.response.periods import Played
+from tests.machine.conftest import KNEE, make_knee
 from tests.machine.test_bringup import MAIN
 from tests.machine.test_outer_loop import Quiet, make_log, run, take_link
 
@@ -89,3 +91,28 @@ def test_without_the_plant_of_the_link_there_is_no_such_reference(impedance):
     plants = {"stand": impedance.design[0], "knee": so.plants.rotary()}
     plan = so.bring_up(impedance, plants, impedance.design[1], samples=2, fractions=(), limits={"tau_s": 40.0})
     assert plan.stages[-1].around is None and "over the stiffness, 20 N m/rad" in " ".join(repr(plan).split())
+
+
+def test_an_outer_loop_that_is_not_stable_on_its_link_is_not_to_be_closed():
+    """A stiffness of the link as large as its spring's is more than the law follows."""
+    plan = plan_outer(make_knee(300.0), take_link())
+    text = " ".join(repr(plan).split())
+    assert plan.stages[-1].around is None and plan.to_dict()["stages"][-1]["outer_unstable"]
+    assert "DO NOT CLOSE ITS OUTER LOOP: by the model it is not stable with the link as in knee" in text
+    assert "over the stiffness" not in text
+
+
+def test_rows_that_the_outer_loops_filter_forgets_in_are_counted_and_how_long_to_record_is_that_of_its_own_reference(
+    impedance,
+):
+    around = plan_outer(impedance, take_link()).stages[-1].around
+    period = around.excitation.waves.shape[1]
+    played = Played(period_s=77.0, lasts_s=777.0, outer=Played(period_s=period * 1e-3, lasts_s=12 * period * 1e-3))
+    log = make_log(run(impedance, around.excitation.reference[: 3 * period // 2]))
+    result = so.accept(impedance, [log], link=take_link(), played=played)
+    text, (why,) = " ".join(repr(result).split()), result.left_out.values()
+    assert result.replayed and result.response is None
+    assert f"of {period * 1e-3:.3g} s each" in why and f"{12 * period * 1e-3:.4g} s" in why and "77" not in why
+    rows = math.ceil(35.0 / math.log(6.0 / 5.0))  # of a filter of 5 ms by backward differences
+    assert f"Of knee the first {rows} rows are left out" in text
+    assert result.to_dict()["replay"]["logs"][0]["begins"] == rows

@@ -69,6 +69,10 @@ OUTER = (
     "These stages are of the force law alone: leave the outer loop out, with the link as in the design plant, and give "
     "the law the reference itself. Close the outer loop after the last stage, and log {}"
 )
+UNSTABLE = (
+    "These stages are of the force law alone. DO NOT CLOSE ITS OUTER LOOP: by the model it is not stable with the link "
+    "as in {}, so that there is no reference to play with it. Choose another stiffness or damping, and certify."
+)
 PLACE = (
     "its x_0 as the reference, with the link's position: seaopt accept replays both, and judges the loop with the "
     "outer loop in it. {}"
@@ -92,6 +96,13 @@ def summarise(result: BringUp) -> list[KeyFigure]:
     ]
 
 
+def _say_outer(stages: Sequence[Stage], outer: OuterLoop) -> str:
+    """Return when to close the outer loop, and what to log then."""
+    if any(stage.outer_unstable for stage in stages):
+        return UNSTABLE.format(outer.plant or "the plant of the link")
+    return OUTER.format(_say_logged(stages[-1], outer))
+
+
 def _say_logged(stage: Stage, outer: OuterLoop) -> str:
     """Return what to log with an outer loop closed, and what to play where there is no reference for it."""
     if not outer.stiffness:
@@ -105,7 +116,7 @@ def describe(result: BringUp) -> list[Section]:
     rows = tuple(_list_row(stage) for stage in result.stages)
     head = ("stage", "law", "bandwidth (Hz)", "stuck (Hz)", "limit", "reference", "lasts (s)", "Ms expected")
     last = result.stages[-1].controller
-    outer = () if last.outer is None else (OUTER.format(_say_logged(result.stages[-1], last.outer)),)
+    outer = () if last.outer is None else (_say_outer(result.stages, last.outer),)
     still = [stage.name for stage in result.stages if stage.still]
     held = (HELD.format(join_words(still)),) if still else ()
     overview = Section(

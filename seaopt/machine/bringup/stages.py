@@ -61,7 +61,10 @@ class Stage(Expected):
     place : float or None
         Where a schedule's variable is to stand.
     around : OuterExpected or None
-        Of the full law: what to play when its outer loop is closed, too, where the plant of its link is known.
+        Of the full law: what to play when its outer loop is closed, too, where the plant of its link is known, and the
+        loop is stable on it.
+    outer_unstable : bool
+        Whether the plant of the link is known, and by the model the outer loop is not stable on it.
     """
 
     name: str
@@ -70,6 +73,7 @@ class Stage(Expected):
     note: str = ""
     place: float | None = None
     around: OuterExpected | None = None
+    outer_unstable: bool = False
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -112,6 +116,7 @@ def _describe(stage: Stage) -> dict[str, Any]:
         "rate_hz": 1.0 / controller.sample_time_s,
         **_describe_played(stage),
         "outer": None if around is None else _describe_played(around),
+        "outer_unstable": stage.outer_unstable,
     }
 
 
@@ -276,6 +281,8 @@ def bring_up(
         stage = _make_stage(name, controller, certificate, "", draws, options | {"most": share, "place": place})
         outer = stage.controller.outer
         enclosed = enclose_link(stage.controller, link, None if over is None or place is None else (over, place))
+        if outer is not None and link is not None and enclosed is None:
+            stage = replace(stage, outer_unstable=True)
         if outer is not None and enclosed is not None:
             part = options | {"most": share, "bias": 0.0, "limits": of_link}
             stage = replace(stage, around=expect_outer(stage.controller, outer, enclosed, draw(enclosed), part))

@@ -106,6 +106,10 @@ IN_PART = (
     "No row explains all of it to the noise. An interval holds where nothing but its row differs; the true size may be "
     "outside."
 )
+BEGINS = (
+    "Of {} the first {} are left out: in them the filter of the outer loop's velocity forgets what was before the log, "
+    "which the log does not have."
+)
 HIDDEN = (
     "In {} no tick is off by more than rounding allows, but all of them together are: what that cause makes stands out "
     "of the rounding of the whole log by {} std."
@@ -332,6 +336,11 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         _say_gaps(Path(source).name, gaps, row)
         for source, gaps, row in zip(result.sources, result.gaps, result.replays, strict=True)
         if gaps
+    )
+    remarks += tuple(
+        BEGINS.format(Path(source).name, format_count(row.begins, "row"))
+        for source, row in zip(result.sources, result.replays, strict=True)
+        if row.begins > 1
     )
     remarks += tuple(
         f"In {Path(source).name} {say_trip(result.controller, row.trip)}. What comes after is left out of the response "

@@ -42,6 +42,7 @@ class Played:
 
     period_s: float
     lasts_s: float  # all of it
+    outer: Played | None = None  # what was to be played with the outer loop closed
 
 
 @record
