@@ -19,9 +19,9 @@ STEPS = 20  # integration steps per tick
 
 @dataclass(frozen=True)
 class Machine:
-    """THOR's stand: M = J/r^2, b = b_r/r^2, per ampere eta K_tau/r, r = l/(2 pi N_p)."""
+    """THOR's stand: M = J/r^2 + m_l, b = b_r/r^2, per ampere eta K_tau/r, r = l/(2 pi N_p)."""
 
-    mass: float = 3.31e-6 / (0.002 / (6.0 * math.pi)) ** 2
+    mass: float = 3.31e-6 / (0.002 / (6.0 * math.pi)) ** 2 + 0.646
     damping: float = 1.31e-4 / (0.002 / (6.0 * math.pi)) ** 2
     stiffness: float = 655000.0
     per_ampere: float = 0.0255 / (0.002 / (6.0 * math.pi))

@@ -120,8 +120,8 @@ def explain(
         tried = [limit, *tried] if told else sorted((*tried, limit), key=lambda each: each.rank)
     kinds = _group(tried, noise)
     if tried[0].left > comparison.most_noise * noise:
-        least, starts = min(each.left for each in tried), _list_starts(case, kinds, limit, limited)
-        pairs = find_pairs(starts, _list_knobs(case), values, spread, (least, noise))
+        starts = _list_starts(case, kinds, limit, limited)
+        pairs = find_pairs(starts, _list_knobs(case), values, spread, tried, noise)
         kinds = [*([pair] for pair in pairs), *kinds]
     return _list_found(case, kinds, told=told)
 

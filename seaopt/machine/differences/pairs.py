@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -32,10 +33,15 @@ class Start:
 
 
 def find_pairs(
-    starts: Sequence[Start], knobs: Sequence[Knob], values: ParameterSet, spread: Spread, left: tuple[float, float]
+    starts: Sequence[Start],
+    knobs: Sequence[Knob],
+    values: ParameterSet,
+    spread: Spread,
+    singles: Sequence[Tried],
+    noise: float,
 ) -> list[Tried]:
-    """Return the pairs of causes that explain much more than the best single one, the best first, those that are as
-    good beside it. `knobs`: of the second causes; `left`: of the misfit by the best single cause, and by noise.
+    """Return the pairs of causes that explain much more than the best of `singles`, the best first, those that are as
+    good beside it. `knobs`: of the second causes; `noise`: what it leaves of the misfit.
     """
     best = min(starts, key=lambda start: start.single.left, default=None)
     if best is None or best.single.difference.low is None:  # more of it than is tried may be all
@@ -51,8 +57,8 @@ def find_pairs(
             break
         seen.append({*search.names})
         found += _search_on(start, search, values, spread)
-    least, noise = left
-    found = [each for each in found if _is_worth(each, least, noise)]
+    least, alone = min(each.left for each in singles), {each.difference.name: each.left for each in singles}
+    found = [_order(each, alone) for each in found if _is_worth(each, least, noise)]
     found.sort(key=lambda each: each.left)
     return _fold([each for each in found if each.is_untold(found[0], noise)])
 
@@ -82,6 +88,13 @@ def _search_on(start: Start, search: Search, values: ParameterSet, spread: Sprea
     return [
         each.conclude(values) for each in refine(start.comparison, spread, values, [replace(pair, slopes=there)], 2)
     ]
+
+
+def _order(pair: Tried, alone: Mapping[str, float]) -> Tried:
+    """Return a pair with that cause first which by itself leaves the least."""
+    parts = sorted((pair.difference, *pair.difference.beside), key=lambda part: alone.get(part.name, math.inf))
+    first, *others = (replace(part, beside=()) for part in parts)
+    return replace(pair, difference=replace(first, beside=tuple(others)))
 
 
 def _is_worth(pair: Tried, single: float, noise: float) -> bool:
