@@ -71,10 +71,10 @@ def test_where_noise_hides_the_distortion_both_are_named(controller, bench):
     level = 0.45 * float(np.max(np.abs(bench.log(RIGHT, REFERENCE, noise=0.1)["I"][1000:])))
     result = accept(controller, bench.log(replace(RIGHT, drive_limit=level), REFERENCE, noise=10.0))
     first, second = result.differences.found
-    assert list_first(result) == ["drive limit", "parameter"] and {"eta", "gain"} <= {second.name, *second.alike}
+    assert first.kind == "drive limit" and {"eta", "gain"} <= {second.name, *second.alike}
     assert first.low <= level <= first.high
     text = " ".join(str(result).split())
-    assert "of what is commanded; or eta is" in text and "told apart by a log at half the amplitude" in text
+    assert "of what is commanded; or " in text and "told apart by a log at half the amplitude" in text
 
 
 def test_a_limited_drive_gives_no_more_than_its_limit():
