@@ -131,7 +131,7 @@ class Comparison:
         shakes the motor.
         """
         reference = share * ticks.reference
-        if find_noise_share(self.controller, ticks) < SHAKES:
+        if not has_dry_friction(self.controller) or find_noise_share(self.controller, ticks) < SHAKES:
             return run_design(source, sets, reference, rate=self.rate).outputs
         noise = dict(zip(self.controller.signals, measure_noise(ticks), strict=True))
         sensors = Sensors(noise_std={name: std for name, std in noise.items() if name in source.signals})
