@@ -97,7 +97,8 @@ def accept_logs(
     beside = {name: unit for plant in plants for name, unit in plant.outputs.items()}
     with show_progress(errors, "judging the logs", errors.say) as tell:
         tell("reading the logs", 0.0)
-        read = [read_loop_log(session.problem, log, units, reference, beside=beside) for log in logs]
+        held = () if controller.outer is None else (controller.outer.position,)  # in the stages of the law alone
+        read = [read_loop_log(session.problem, log, units, reference, beside=beside, at_rest=held) for log in logs]
         for text in (f"note: {log.source}: {note}" for log in read for note in log.notes):
             errors.wrap(text)
         tell("replaying the law, and comparing the machine with its model", 0.1)

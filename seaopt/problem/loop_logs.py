@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -34,13 +34,15 @@ def read_loop_log(
     reference: str | None = None,
     *,
     beside: Mapping[str, str] | None = None,
+    at_rest: Collection[str] = (),
 ) -> Log:
     """Return a log taken under a law, with the channels that the law has and its reference.
 
     A column is that of [acceptance], else of the experiment of the controller's plant, else of the channel's own name.
     One that states no unit has the law's. `units`: of each channel, that of the reference by the name "reference".
     `reference`: its column, by the header, with its unit or without. `beside`: channels that are read, too, with their
-    units, where the log has the column that the experiment or [acceptance] gives them. Raises LogError: a column is
+    units, where the log has the column that the experiment or [acceptance] gives them. `at_rest`: channels that may be
+    constant, besides these, and are not noted then. Raises LogError: a column is
     missing, or the log cannot be read.
     """
     table = problem.table.acceptance
@@ -63,6 +65,7 @@ def read_loop_log(
         if name == STATUS and (field is None or field.kind.rstrip("0123456789") not in NUMBERS):
             continue  # words of another kind
         has_none = column.unit is None and field is not None and field.unit is None
+        column = replace(column, at_rest=name in beside or name in at_rest)
         channels[name] = replace(column, unit=unit or "-") if has_none else column
     if not channels:
         raise LogError(

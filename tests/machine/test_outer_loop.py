@@ -256,6 +256,11 @@ def test_the_command_writes_it_as_an_experiment_of_the_links_plant(tmp_path):
     assert "experiments.toml" in done.output, done.output
     tables = (tmp_path / "out" / "again" / "experiments.toml").read_text()
     assert 'plant = "knee"' in tables and 'theta_l = "theta_l [rad]"' in tables
+    rows = run(law, excite(20.0, 7))
+    rows[:, 3] = 0.0  # the law alone, on a link that is held, as it was told
+    so.write_log(make_log(rows, inner=True), tmp_path / "held.csv")
+    done = call(app, ["accept", options[0], str(tmp_path / "held.csv"), *options[1:]])
+    assert "in 1 of 1 log" in " ".join(done.output.split()) and "is constant" not in done.output, done.output
     (tmp_path / "knee.toml").write_text(text + tables)
     (experiment,) = so.read_problem(tmp_path / "knee.toml").experiments()
     assert experiment.delay_s.value == 4e-4 and experiment.delay_s.free  # the drive's, behind the program's

@@ -44,6 +44,8 @@ class Column:
         `column` is not a column but a constant that the header states ("kp = 200"); the channel has that value always.
     shared : bool
         Another channel of the same unit may be the same column, which is otherwise taken for a mistake.
+    at_rest : bool
+        That it is constant is expected, and not noted.
 
     Examples
     --------
@@ -63,6 +65,7 @@ class Column:
     where: Mapping[str, str | float] | None = None
     from_header: bool = False
     shared: bool = False
+    at_rest: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.column, bool) or not isinstance(self.column, str | int):

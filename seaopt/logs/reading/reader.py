@@ -114,7 +114,7 @@ def read_table(
     for name, channel in chosen.channels.items():
         digest_of_file = hashes[channel.file_column.source.path]
         signals[name] = _build_signal(name, channel, arrays.pop(name), chosen.clock, digest_of_file)
-        notes += _remark_on(signals[name])
+        notes += _remark_on(signals[name], at_rest=channel.file_column.column.at_rest)
     names = ", ".join(str(source.path) for source in sources)
     law = next((source.law for source in sources if source.law), "")
     return Table(time=clock, signals=signals, source=names, notes=tuple(notes), law=law)
@@ -347,12 +347,14 @@ def _build_signal(name: str, channel: SelectedChannel, values: VectorN, clock: C
     )
 
 
-def _remark_on(signal: Signal) -> list[str]:
+def _remark_on(signal: Signal, *, at_rest: bool) -> list[str]:
     """Return notes on what looks wrong with a channel at first sight."""
     low, high = np.fmin.reduce(signal.values), np.fmax.reduce(signal.values)
     if not np.isfinite(low):
         return [f"{signal.name}: holds no number"]
-    if low == high and signal.name != STATUS:  # which stays where nothing happens
+    if low == high and (at_rest or signal.name == STATUS):  # which stays where nothing happens
+        return []
+    if low == high:
         return [f"{signal.name}: is constant at {low:.6g} {signal.unit}".rstrip()]
     bits = suspect_wrap(signal.values, low, high)
     if bits is not None:
