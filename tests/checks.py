@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from seaopt.estimation.judgement.hypothesis_search import Search
+from seaopt.estimation.judgement.hypothesis_search import TriedHypotheses
 from seaopt.robustness.certificate import certify
 from seaopt.robustness.certificate.cases import Check
 
@@ -16,4 +16,4 @@ def leave_out(patch: pytest.MonkeyPatch, *checks: Check) -> None:
 
 def leave_out_hypotheses(patch: pytest.MonkeyPatch) -> None:
     """Let fits try no part that the model may lack: most of such a fit's time, and no std depends on it."""
-    patch.setattr("seaopt.estimation.judgement.judge.search_hypotheses", lambda *_, **__: Search())
+    patch.setattr("seaopt.estimation.judgement.judge.search_hypotheses", lambda *_, **__: TriedHypotheses())

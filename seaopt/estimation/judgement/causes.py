@@ -33,7 +33,7 @@ from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment,
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.solver.budget import Budget
+from seaopt.estimation.solver.budget import EvaluationBudget
 from seaopt.estimation.solver.settle import (
     ROUGH_ITERATIONS,
     Solved,
@@ -64,7 +64,7 @@ FIRST_DELAYS = (0, -2, 5, 20, -20)  # samples, from which a refit with a free de
 
 
 @record(eq=False)
-class Cause:
+class Explanation:
     """Another explanation of the logs."""
 
     text: str  # with what it does to the residuals and the estimates
@@ -92,9 +92,9 @@ def find_causes(
     poor: bool,
     noticed: bool = True,
     hypotheses: Sequence[Refit] = (),
-    budget: Budget | None = None,
+    budget: EvaluationBudget | None = None,
     progress: Progress = ignore,
-) -> list[Cause]:
+) -> list[Explanation]:
     """Return what explains the logs better than the fit, the best first. `fit`: with its minimum; `residuals`: of the
     fit; `suspects`: what was fixed and is at odds with the logs; `alternatives`: other plants that may have been on the
     bench; `poor`: whether the fit explains so little that its estimates are no start: what searches does so from its
@@ -152,7 +152,7 @@ def find_causes(
     return _drop_worse(fit, causes)
 
 
-def _drop_worse(fit: Fit, causes: list[Cause]) -> list[Cause]:
+def _drop_worse(fit: Fit, causes: list[Explanation]) -> list[Explanation]:
     """Return the causes, the best first, with the better over held-out samples of channels that are late and the
     spring's damper; both where chance alone sets them apart, or neither is the best.
     """
@@ -167,7 +167,7 @@ def _drop_worse(fit: Fit, causes: list[Cause]) -> list[Cause]:
     return [cause for cause in causes if cause is not worse]
 
 
-def _find_rivals(fit: Fit, causes: Sequence[Cause]) -> tuple[Cause | None, Cause | None]:
+def _find_rivals(fit: Fit, causes: Sequence[Explanation]) -> tuple[Explanation | None, Explanation | None]:
     """Return the first cause of channels that are late, and of the spring's damper; None where there is none."""
     dampers = {e.plant.spring.damper for e in fit.experiments if e.plant.spring is not None}
     late = next((cause for cause in causes if cause.apart), None)
@@ -285,7 +285,7 @@ def _compare_gains(problem: FitProblem, z: Vector, gains: Sequence[str]) -> Vect
 
 def _weigh_hypotheses(
     fit: Fit, hypotheses: Sequence[Refit], before: Float[np.ndarray, "outputs 2"], colour: float
-) -> Iterator[Cause]:
+) -> Iterator[Explanation]:
     """Yield what hypotheses about what the model lacks are worth, each with the part that brings it."""
     for refit in hypotheses:
         added = join_words([f"{name} = {value:.4g}" for name, value in {**refit.frees, **refit.fixed}.items()])
@@ -318,7 +318,7 @@ def _weigh(
     colour: float,
     *,
     poor: bool,
-) -> Cause | None:
+) -> Explanation | None:
     """Return what a refit is worth; None where chance gives as much, where it is no other explanation, or where its
     slopes do not tell how well its values are known.
     """
@@ -348,7 +348,7 @@ def _weigh(
         _, name = max(moved)
         effects.append(f"moves {name} from {fit.parameters[name].value:.4g} to {values[name]:.4g}")
     jumps = candidate.jumps(values, stds)
-    return Cause(
+    return Explanation(
         text=f"{text} ({' and '.join(effects)})" if effects else text,
         where=candidate.where,
         gain=gain,

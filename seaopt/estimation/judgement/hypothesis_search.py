@@ -41,7 +41,7 @@ from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome, spell_parameters, spell_parts
-from seaopt.estimation.solver.budget import Budget
+from seaopt.estimation.solver.budget import EvaluationBudget
 from seaopt.estimation.solver.least_squares import FIRST_RADIUS, find_blocked, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
 from seaopt.estimation.solver.step_shares import copy_steps
@@ -126,7 +126,7 @@ class Refit:
 
 
 @record(eq=False)
-class Search:
+class TriedHypotheses:
     """What was tried: the hypotheses that remove the excess, those as good as the best, and a row for each."""
 
     able: tuple[Refit, ...] = ()
@@ -136,7 +136,7 @@ class Search:
     partial: Mapping[str, float] | None = None
     ended: bool = False  # by its budget, before all was tried
 
-    def yield_to_another(self) -> Search:
+    def yield_to_another(self) -> TriedHypotheses:
         """Return the search where another cause explains the logs better, so that none is adopted."""
         rows = (replace(row, outcome="tied") if row.outcome == "adopted" else row for row in self.trials)
         return replace(self, trials=tuple(rows))
@@ -146,11 +146,11 @@ def search_hypotheses(
     fit: Fit,
     residuals: ResidualsByExperiment,
     floors: Mapping[str, NoiseFloor],
-    budget: Budget,
+    budget: EvaluationBudget,
     progress: Progress = ignore,
     *,
     doubtful: bool = False,
-) -> Search:
+) -> TriedHypotheses:
     """Return the hypotheses that were tried, the best first; none where the residual asks for none.
 
     `fit`: with its minimum, `residuals`, `floors`: there; `budget`: what the search may take; `doubtful`: whether
@@ -159,7 +159,7 @@ def search_hypotheses(
     minimum = fit.require_minimum("search_hypotheses")
     first = _find_excess(minimum.problem, residuals, floors)
     if (first <= ASKS and not doubtful) or minimum.problem.predicts:
-        return Search()
+        return TriedHypotheses()
     search = _Search(fit, minimum, first, budget, progress)
     judged = _judge(search.run(), first, measure_colour(fit.covariance, fit.white_covariance))
     return replace(judged, ended=search.ended)
@@ -168,7 +168,7 @@ def search_hypotheses(
 class _Search:
     """A search's budget, and what it knows of the fit; lives only inside `search_hypotheses`."""
 
-    def __init__(self, fit: Fit, minimum: Minimum, first: float, budget: Budget, progress: Progress) -> None:
+    def __init__(self, fit: Fit, minimum: Minimum, first: float, budget: EvaluationBudget, progress: Progress) -> None:
         self.fit, self.minimum, self.budget, self.progress = fit, minimum, budget, progress
         self.first, self.helps = first, HELPS * (1.0 - max(first, 1.0) ** -2)
         self.sizes = measure_sizes(fit)
@@ -283,7 +283,7 @@ def _or_none(refit: Callable[P, Refit | None]) -> Callable[P, Refit | None]:
 
 @_or_none
 def _refit(
-    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, budget: Budget
+    change: Change, old: FitProblem, fitted: Evaluation, helps: float, base: Evaluation, budget: EvaluationBudget
 ) -> Refit | None:
     """Return the minimum with a change, from the fit's, `base` the fit without any; None where it cannot be simulated.
 
@@ -300,13 +300,13 @@ def _refit(
 
 
 @_or_none
-def _refit_alone(change: Change, pair: Refit, helps: float, base: Evaluation, budget: Budget) -> Refit | None:
+def _refit_alone(change: Change, pair: Refit, helps: float, base: Evaluation, budget: EvaluationBudget) -> Refit | None:
     """Return the minimum with one part of a pair, from the pair's values, as `_refit` does; whatever is left of the
     budget, for a pair is not believed without.
     """
     problem = _pose(change, pair.problem)
     start = problem.evaluate(problem.unknowns.start_from(pair.values))
-    budget = Budget.begin(ROUNDS * ROUND, max(budget.unit, problem.count_work(start.z)))
+    budget = EvaluationBudget.begin(ROUNDS * ROUND, max(budget.unit, problem.count_work(start.z)))
     return _descend(change, problem, start, base, base, helps, budget)
 
 
@@ -325,7 +325,7 @@ def _descend(
     fitted: Evaluation,
     base: Evaluation,
     helps: float,
-    budget: Budget,
+    budget: EvaluationBudget,
 ) -> Refit | None:
     """Return the minimum that rounds of iterations come to from a start, as `_refit` does."""
     before = count_evaluations()
@@ -403,7 +403,7 @@ def _settle(refit: Refit, start: Evaluation) -> Refit:
 
 
 def _choose_start(
-    change: Change, problem: FitProblem, fitted: dict[str, float], at_fit: Evaluation, budget: Budget
+    change: Change, problem: FitProblem, fitted: dict[str, float], at_fit: Evaluation, budget: EvaluationBudget
 ) -> tuple[FitProblem, Evaluation]:
     """Return the evaluation at the fit's values and the best start of what is added, with steps that hold there: that
     from which a step of all else is to gain the most, for what a fit has in place of an effect is at odds with most.
@@ -516,7 +516,7 @@ def _takes_half(before: float, after: float) -> bool:
     return after**2 - 1.0 <= HALF * (before**2 - 1.0)
 
 
-def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
+def _judge(refits: Sequence[Refit], first: float, colour: float) -> TriedHypotheses:
     """Return what became of each hypothesis, the best first: of those as good the one with the fewest unknowns.
     `first`, `colour`: of the fit, its excess and how many times more than for white residuals its estimates vary.
     """
@@ -549,7 +549,9 @@ def _judge(refits: Sequence[Refit], first: float, colour: float) -> Search:
     outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]], *left]
     ranked = [*tied, *others]
     trials = tuple(_state(refit, outcome, first) for refit, outcome in zip(ranked, outcomes, strict=True))
-    return Search(able=tuple(tied), trials=trials, partial=None if able else find_partial(refits, first, colour))
+    return TriedHypotheses(
+        able=tuple(tied), trials=trials, partial=None if able else find_partial(refits, first, colour)
+    )
 
 
 def find_partial(refits: Sequence[Refit], first: float, colour: float) -> Mapping[str, float] | None:

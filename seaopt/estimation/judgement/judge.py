@@ -19,9 +19,9 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.estimation.judgement.another_start import find_other_minimum
-from seaopt.estimation.judgement.causes import Cause, find_causes
+from seaopt.estimation.judgement.causes import Explanation, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
-from seaopt.estimation.judgement.hypothesis_search import Search, search_hypotheses
+from seaopt.estimation.judgement.hypothesis_search import TriedHypotheses, search_hypotheses
 from seaopt.estimation.judgement.intervals import (
     find_excesses,
     find_rough,
@@ -41,7 +41,7 @@ from seaopt.estimation.result.findings import FitFinding, OutputFit, find_ended_
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.widening import widen
-from seaopt.estimation.solver.budget import EVALUATIONS, Budget
+from seaopt.estimation.solver.budget import EVALUATIONS, EvaluationBudget
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
@@ -126,7 +126,7 @@ def judge(
         *another,
     ]
     suspects = {name: test for name, test in _run_tests(fit, minimum, freed).items() if test.p < DOUBTFUL}
-    budget = Budget.begin((OF_HYPOTHESES + OF_CAUSES) * evaluations, minimum.problem.count_work(minimum.z))
+    budget = EvaluationBudget.begin((OF_HYPOTHESES + OF_CAUSES) * evaluations, minimum.problem.count_work(minimum.z))
     with budget.enforce():
         fit, findings, search = _search_causes(
             fit, findings, residuals, floors, error, suspects, alternatives, budget, evaluations, trying
@@ -143,15 +143,15 @@ def _search_causes(
     error: ModelError,
     suspects: Mapping[str, ScoreTest],
     alternatives: Sequence[Plant],
-    budget: Budget,
+    budget: EvaluationBudget,
     evaluations: int,
     progress: Progress,
-) -> tuple[Fit, list[FitFinding], Search]:
+) -> tuple[Fit, list[FitFinding], TriedHypotheses]:
     """Return the fit with intervals that reach to what explains it as well, its findings with the causes that are
     named, and what became of each hypothesis. `findings`: those yet; `evaluations`: those of a share of the budget.
     """
     if any(finding.kind == "initial" and finding.severity == "error" for finding in findings):
-        return fit, findings, Search()  # what is left of a transient looks like much else
+        return fit, findings, TriedHypotheses()  # what is left of a transient looks like much else
     noticed = (
         any(ratio > FAR for ratio in error.excess.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)
@@ -160,7 +160,7 @@ def _search_causes(
     little = any(finding.kind == "explained" for finding in findings)
     doubtful = _hangs_on_little(fit, findings)
     looking = budget.part(OF_HYPOTHESES * evaluations)
-    search = Search()
+    search = TriedHypotheses()
     if not little:
         # What settles them may take more than their share, and leaves the other causes one.
         with budget.enforce(leaving=evaluations):
@@ -473,12 +473,12 @@ def _run_tests(fit: Fit, minimum: Minimum, freed: Freed | None) -> dict[str, Sco
     return tests
 
 
-def _list_rivals(causes: Sequence[Cause]) -> list[Cause]:
+def _list_rivals(causes: Sequence[Explanation]) -> list[Explanation]:
     """Return the causes that explain the residuals as well as the best, up to three."""
     return [cause for cause in causes if cause.gain > RIVAL_SHARE * causes[0].gain][:3]
 
 
-def _name_causes(fit: Fit, causes: Sequence[Cause], suspects: Mapping[str, ScoreTest]) -> Iterator[FitFinding]:
+def _name_causes(fit: Fit, causes: Sequence[Explanation], suspects: Mapping[str, ScoreTest]) -> Iterator[FitFinding]:
     """Yield the explanation that is the most likely, and others that explain as much."""
     against = next((name for name, test in suspects.items() if test.p < CHANCE), None)
     if not causes and against is not None:

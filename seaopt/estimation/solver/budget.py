@@ -1,10 +1,11 @@
 """What a judgement may spend on refits, counted so that the same log has the same answer on any machine.
 
-It is counted in evaluations, of which no more are made than the whole allows (`Budget.enforce`): a search that comes to
-its end keeps what it has. Parts of the whole are asked before a refit begins. In them an evaluation takes its
-integration steps, and about as long as one for the residual of each sample and its sums; one that takes many times what
-the fit's last one took counts for more. Where each counted for what it takes, the search would end before it came to
-bristles that are the cause: they need three to nine times the fit's, and two of six such actuators were not explained.
+It is counted in evaluations, of which no more are made than the whole allows (`EvaluationBudget.enforce`): a search
+that comes to its end keeps what it has. Parts of the whole are asked before a refit begins. In them an evaluation takes
+its integration steps, and about as long as one for the residual of each sample and its sums; one that takes many times
+what the fit's last one took counts for more. Where each counted for what it takes, the search would end before it came
+to bristles that are the cause: they need three to nine times the fit's, and two of six such actuators were not
+explained.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ OUT_OF_PROPORTION = 20.0  # times that: a refit that takes more is left
 
 
 @record
-class Budget:
+class EvaluationBudget:
     """Evaluations that may be made from where it was begun, and what one at the fit's minimum takes (`count_work`)."""
 
     evaluations: float
@@ -32,13 +33,13 @@ class Budget:
     work_before: int
 
     @classmethod
-    def begin(cls, evaluations: float, unit: int) -> Budget:
+    def begin(cls, evaluations: float, unit: int) -> EvaluationBudget:
         """Return a budget from here on."""
         return cls(evaluations=evaluations, unit=unit, evaluations_before=count_evaluations(), work_before=count_work())
 
-    def part(self, evaluations: float) -> Budget:
+    def part(self, evaluations: float) -> EvaluationBudget:
         """Return a budget from here on that is a part of this one: of at most so many, or all that may be made."""
-        return Budget.begin(min(evaluations, self.evaluations - self.made), self.unit)
+        return EvaluationBudget.begin(min(evaluations, self.evaluations - self.made), self.unit)
 
     def enforce(self, leaving: float = 0.0) -> AbstractContextManager[None]:
         """Refuse evaluations inside beyond this budget, and the last `leaving` of it."""

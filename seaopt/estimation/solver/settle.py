@@ -14,7 +14,7 @@ from seaopt.estimation.problem.shapes import PerOutput, Vector
 from seaopt.estimation.solver.least_squares import DECREMENT, STILL_MOVING, Callback, Solution, find_blocked, minimise
 from seaopt.estimation.solver.step_shares import even_steps, share_many, share_steps
 from seaopt.estimation.solver.step_size import (
-    Checks,
+    StepChecks,
     StepError,
     bound_steps,
     check_steps,
@@ -150,7 +150,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
     flat = measure_flatness(problem)
     if flat:
         decrement = JUMPY_DECREMENT
-    checks: Checks = {}
+    checks: StepChecks = {}
     rough, before = problem.straight and not explains_little(problem, evaluation.power), 0.0
     if rough:  # so good a start gives sigmas good enough to come near the minimum, and there they are estimated well
         problem = problem.with_values("sigma", estimate_sigma(problem, evaluation.power, evaluation.z))

@@ -47,7 +47,7 @@ class StepError:
 
 
 @record(eq=False)
-class Check:
+class StepCheck:
     """The step error of an experiment, where it was found, and with which steps."""
 
     error: StepError
@@ -55,7 +55,7 @@ class Check:
     substeps: int
 
 
-Checks = Mapping[str, Check]  # by experiment, those that are known
+StepChecks = Mapping[str, StepCheck]  # by experiment, those that are known
 
 
 def choose_first_steps(
@@ -124,7 +124,9 @@ def refine_bristles(problem: FitProblem, z: Vector) -> FitProblem:
     return share_steps(problem, z, _list_finer(problem, steps, finer))
 
 
-def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) -> tuple[FitProblem, Evaluation, Checks]:
+def refine_steps(
+    problem: FitProblem, evaluation: Evaluation, checks: StepChecks
+) -> tuple[FitProblem, Evaluation, StepChecks]:
     """Return the problem with steps whose error is small, its evaluation there, and the errors that are known there.
     That of a step that was made finer is not: its order says how fine it must be, and the next minimum is looked at.
     """
@@ -149,14 +151,14 @@ def refine_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) ->
             return problem, evaluation, checks
 
 
-def check_steps(problem: FitProblem, evaluation: Evaluation, checks: Checks) -> Checks:
+def check_steps(problem: FitProblem, evaluation: Evaluation, checks: StepChecks) -> StepChecks:
     """Return the step error of every experiment: known still, where neither its step nor the minimum has changed."""
 
-    def check(experiment: FitExperiment) -> Check:
+    def check(experiment: FitExperiment) -> StepCheck:
         earlier, substeps = checks.get(experiment.name), experiment.count_steps(evaluation.z)
         if earlier is not None and earlier.substeps == substeps and _lies_near(evaluation, earlier.z):
             return earlier
-        return Check(error=measure_step_error(problem, experiment, evaluation), z=evaluation.z, substeps=substeps)
+        return StepCheck(error=measure_step_error(problem, experiment, evaluation), z=evaluation.z, substeps=substeps)
 
     return {e.name: made for e, made in zip(problem.experiments, problem.map(check), strict=True)}
 
@@ -169,7 +171,7 @@ def _lies_near(evaluation: Evaluation, z: Vector) -> bool:
     return bool(np.isfinite(distance) and distance < NEARBY**2)
 
 
-def find_worst(checks: Checks) -> StepError:
+def find_worst(checks: StepChecks) -> StepError:
     """Return the largest of all experiments' errors."""
     errors = [check.error for check in checks.values()]
     return StepError(output=max(error.output for error in errors), parameter=max(error.parameter for error in errors))

@@ -14,7 +14,7 @@ from scipy import signal
 
 import seaopt as so
 from seaopt.estimation.problem.fit_problem import BudgetError, FitProblem, count_left, limit_evaluations
-from seaopt.estimation.solver.budget import EVALUATIONS, Budget
+from seaopt.estimation.solver.budget import EVALUATIONS, EvaluationBudget
 from seaopt.estimation.solver.least_squares import minimise
 from tests.actuator_logs import KNEE, SCREW, drive, integrate, screw
 
@@ -147,7 +147,7 @@ def test_a_search_that_may_not_go_on_returns_what_it_has():
 def test_a_part_of_a_budget_is_no_more_than_what_is_left_of_it():
     experiment, params = pose_screw(lambda columns: columns)
     minimum = so.fit([experiment], params, diagnostics=False).require_minimum("")
-    budget = Budget.begin(10, minimum.problem.count_work(minimum.z))
+    budget = EvaluationBudget.begin(10, minimum.problem.count_work(minimum.z))
     for _ in range(4):
         minimum.problem.evaluate(minimum.z)
     assert (budget.made, budget.part(3).left, budget.part(100).left) == (4, 3, 6)
