@@ -53,11 +53,16 @@ class Ratio:
         return np.sqrt(np.sum(np.abs(left) ** 2, axis=0) / (p * (p - 1))) / np.abs(self.denominator.mean(axis=0))
 
     @property
-    def sure(self) -> Bool[np.ndarray, " m"]:
-        """Whether what is divided by is far from zero."""
+    def surety(self) -> Float[np.ndarray, " m"]:
+        """How far from zero what is divided by is, over how far makes it sure; it grows with the root of the blocks."""
         mean, p = self.denominator.mean(axis=0), self.blocks
         spread = np.sqrt(np.sum(np.abs(self.denominator - mean) ** 2, axis=0) / (p * (p - 1)))
-        return np.abs(mean) >= SURE * spread
+        return np.abs(mean) / np.maximum(SURE * spread, np.finfo(float).tiny)
+
+    @property
+    def sure(self) -> Bool[np.ndarray, " m"]:
+        """Whether what is divided by is far from zero."""
+        return self.surety >= 1.0
 
     def disc(self, alpha: float) -> tuple[Complex[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Return centres and radii of discs, each of which misses the truth with `alpha`; infinite where nothing is

@@ -401,13 +401,16 @@ def _judge_sensitivity(asked: float | None, measured: Sequence[Measured], alpha:
         slack = distance - x - 0.5 * limit * x**2 - 1.0 / limit
         confirmed = confirmed and bool(np.all(slack >= 0.0) and np.all(part.loop.sure))
         refuted = refuted or bool(np.any(lower > limit))
-        at = int(np.argmin(slack))
-        if slack[at] < least:
-            least, where = float(slack[at]), float(part.f[at])
+        surety = part.loop.surety
+        ranked = np.where(surety < 1.0, np.minimum(slack, surety - 1.0), slack)  # what is not sure decides, too
+        at = int(np.argmin(ranked))
+        if ranked[at] < least:
+            least, where = float(ranked[at]), float(part.f[at])
         room = distance - 1.0 / limit
         allowed = (np.sqrt(1.0 + 2.0 * limit * np.maximum(room, 0.0)) - 1.0) / limit  # x that would just confirm
         share = np.where(room > 0.0, x / np.maximum(allowed, 1e-300), wide[1] / np.maximum(-room, 1e-300))
-        needed = max(needed, float(np.max(share[slack < 0.0], initial=0.0)) ** 2 * part.periods)
+        most = np.max(np.concatenate([share[slack < 0.0], 1.0 / surety[surety < 1.0]]), initial=0.0)
+        needed = max(needed, float(most) ** 2 * part.periods)
     outcome = _decide(confirmed, refuted) if limit is not None else "undecided"
     return Judged(
         name="Ms", limit=limit, sense="at most", value=value, low=low, high=high, unit="-", outcome=outcome,
