@@ -55,6 +55,9 @@ Around any plant, besides those of `seaopt.plants.drives`:
     The motor current lags the command: first order, bandwidth current_loop_hz.
 ``load_cell``
     Forces and torques are read through a first-order sensor of bandwidth load_cell_hz.
+``sensor_filter``
+    They are read through a low-pass of second order, of frequency sensor_filter_hz and damping zeta_f (1/sqrt(2) is
+    Butterworth's), as amplifiers have against aliasing.
 ``command_delay``, ``measurement_delay``
     Dead times T_c before the input and T_m behind the same outputs, as Padé approximants of order three: the phase is
     right to one degree up to a frequency of 0.45/T. `simulate` and experiments take an exact ``delay_s``; the parts are
@@ -92,9 +95,9 @@ from seaopt.records import record
 Part = Literal[
     "stribeck", "load_friction", "load_stribeck", "load_square", "lugre", "hysteresis", "backlash", "hardening",
     "spring_damping", "screw_mode", "droop", "falling_torque", "friction_drift", "friction_direction", "back_driving",
-    "cogging", "stand", "current_loop", "load_cell", "command_delay", "measurement_delay", "voltage_input",
-    "duty_input", "supply_input", "supply_sag", "inductance", "position_servo", "servo_integral", "servo_limit",
-    "servo_hold", "servo_delay", "deflection_sensor", "thermal",
+    "cogging", "stand", "current_loop", "load_cell", "sensor_filter", "command_delay",
+    "measurement_delay", "voltage_input", "duty_input", "supply_input", "supply_sag", "inductance", "position_servo",
+    "servo_integral", "servo_limit", "servo_hold", "servo_delay", "deflection_sensor", "thermal",
 ]  # fmt: skip
 
 SHARPNESS = declare("n_h", 1.0, "-", 1.0, "how much at once it gives way, an exponent")
@@ -140,6 +143,10 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
     ),
     "current_loop": (declare("current_loop_hz", 500.0, "Hz", 1e-6, "current loop bandwidth"),),
     "load_cell": (declare("load_cell_hz", 500.0, "Hz", 1e-6, "load cell bandwidth"),),
+    "sensor_filter": (
+        declare("sensor_filter_hz", 500.0, "Hz", 1e-6, "frequency of the sensor's low-pass"),
+        declare("zeta_f", math.sqrt(0.5), "-", 1e-3, "damping of the sensor's low-pass"),
+    ),
     "command_delay": (declare("T_c", 1e-3, "s", 1e-9, "delay of the command"),),
     "measurement_delay": (declare("T_m", 1e-3, "s", 1e-9, "delay of the measurement"),),
     "servo_delay": (declare("T_v", 1e-3, "s", 1e-9, "delay of the servo's command"),),
@@ -284,6 +291,13 @@ def _lag(p: Any, name: str) -> _Filter:
     return _Filter(a=-ca.SX(rate), b=ca.SX(rate), c=ca.SX(1), d=ca.SX(0))
 
 
+def _low_pass(p: Any, name: str) -> _Filter:
+    """w^2 / (s^2 + 2 zeta w s + w^2); the second state is the rate over w, so that both have the signal's size."""
+    rate = 2 * math.pi * getattr(p, name)
+    a = rate * ca.vertcat(ca.horzcat(ca.SX(0), 1), ca.horzcat(ca.SX(-1), -2 * p.zeta_f))
+    return _Filter(a=a, b=rate * ca.vertcat(0, 1), c=ca.horzcat(ca.SX(1), 0), d=ca.SX(0))
+
+
 def _pade(p: Any, name: str) -> _Filter:
     """exp(-s T) by Padé's (3, 3): (120 - 60 sT + 12 (sT)^2 - (sT)^3) / (120 + 60 sT + 12 (sT)^2 + (sT)^3)."""
     rate = 1 / getattr(p, name)  # in units of T the entries are numbers, and the states have the signal's size
@@ -294,6 +308,7 @@ def _pade(p: Any, name: str) -> _Filter:
 _FILTERS = {
     "current_loop": (_lag, "current_loop_hz", "input", 1),
     "load_cell": (_lag, "load_cell_hz", "output", 1),
+    "sensor_filter": (_low_pass, "sensor_filter_hz", "output", 2),
     "command_delay": (_pade, "T_c", "input", 3),
     "measurement_delay": (_pade, "T_m", "output", 3),
     "servo_delay": (_pade, "T_v", "input", 3),
@@ -317,8 +332,8 @@ _WRAPPERS: dict[str, Callable[[Plant, Sequence[str]], Plant]] = {
 }
 # From the motor outwards; a load cell does not read what encoders do, which the delay of the readings comes after.
 _ORDER = (
-    "current_loop", "servo_delay", "position_servo", "command_delay", "load_cell", "deflection_sensor",
-    "measurement_delay",
+    "current_loop", "servo_delay", "position_servo", "command_delay", "load_cell", "sensor_filter",
+    "deflection_sensor", "measurement_delay",
 )  # fmt: skip
 
 
@@ -332,11 +347,12 @@ def wrapped(
     plant : Plant
         The plant inside.
     parts : sequence of str
-        Of current_loop, load_cell, command_delay and measurement_delay, and of `seaopt.plants.drives`, each once.
+        Of current_loop, load_cell, sensor_filter, command_delay and measurement_delay, and of `seaopt.plants.drives`,
+        each once.
     source : str, optional
         The input that passes current loop and command delay; the first if left out.
     outputs : sequence of str, optional
-        The outputs that pass load cell and measurement delay; those that are regulated if left out.
+        The outputs that pass load cell, filter and measurement delay; those that are regulated if left out.
 
     Raises
     ------

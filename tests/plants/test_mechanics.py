@@ -306,6 +306,21 @@ def test_current_loop_and_load_cell_are_first_order(stand, thor):
         np.testing.assert_allclose(outer(s)[2, 0], inner(s)[2, 0] / (1 + s / (400 * np.pi)), rtol=1e-9)
 
 
+@pytest.mark.parametrize("zeta", [None, 0.4])
+def test_a_sensors_filter_is_a_low_pass_of_second_order(stand, thor, zeta):
+    """Butterworth's where no damping is stated; at rest it reads what is."""
+    plant = wrapped(stand, ["sensor_filter"])
+    params = thor.with_parameters(*plant.defaults.values()).update(
+        sensor_filter_hz=60, **({"zeta_f": zeta} if zeta else {})
+    )
+    inner, outer, w = stand.linearize(thor), plant.linearize(params), 120 * np.pi
+    damping = 2 * (zeta or math.sqrt(0.5))
+    for f in (0.01, 30.0, 60.0, 400.0):
+        s = 2j * np.pi * f / w
+        np.testing.assert_allclose(outer(s * w)[:2, 0], inner(s * w)[:2, 0] / (1 + damping * s + s**2), rtol=1e-9)
+        np.testing.assert_allclose(outer(s * w)[2, 0], inner(s * w)[2, 0], rtol=1e-9)
+
+
 def test_delays_have_the_exact_phase_in_their_band(stand, thor):
     """One degree up to 0.45/T, and unit gain everywhere."""
     plant = wrapped(stand, ["command_delay", "measurement_delay"])

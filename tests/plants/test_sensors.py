@@ -140,7 +140,7 @@ def test_noise_of_encoders_reaches_the_loop():
     np.testing.assert_allclose(*runs, atol=1e-12)
 
 
-@pytest.mark.parametrize("part", ["measurement_delay", "load_cell"])
+@pytest.mark.parametrize("part", ["measurement_delay", "load_cell", "sensor_filter"])
 def test_an_encoders_error_passes_a_delay_and_a_load_cell(part):
     """Both have a gain of 1 at rest, so that an offset e of theta_m is k_n e/N of tau_d, one of theta_l is -k_n e."""
     plant, params = make_knee("free")

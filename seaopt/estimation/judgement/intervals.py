@@ -109,7 +109,7 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
             kind="rough",
             where=name,
             text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "
-            "output, fix it, or give it a prior",
+            "output, or fix it, or give it a prior, at what is known of it from elsewhere",
         )
 
 

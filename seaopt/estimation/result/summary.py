@@ -78,7 +78,8 @@ def summarise(solved: Solved, method: Method, diagnostics: bool, started: float)
     vague = _find_vague(fitted, sizes, identifiability) if status == "converged" else {}
     unidentified = [*vague]
     if vague:
-        message = f"poorly identified: {', '.join(vague.values())}; excite more, fix it, or give it a prior"
+        remedy = "excite more, or fix it, or give it a prior, at what is known of it from elsewhere"
+        message = f"poorly identified: {', '.join(vague.values())}; {remedy}"
     if status == "converged" and (vague or not all(fitted[name].identified for name in names)):
         status = "not_identifiable"
     if statistics is not None and not _explains_something(problem, outputs, statistics):
