@@ -286,13 +286,15 @@ def _measure_event(experiment: Experiment) -> list[float] | None:
 
 def _find_moves(values: Signal) -> tuple[int, int]:
     """Return the blocks from an input's first move to its last, which is left out; none where it never moves."""
-    blocks = np.array_split(values, BLOCKS)
-    power = np.array([float(np.sum(block**2)) for block in np.array_split(np.diff(values), BLOCKS)])
+    power = _sum_blocks(np.diff(values) ** 2)
     rest, largest = float(np.median(power)), float(np.ptp(values))
     power -= rest  # of a reading's noise
     moves = power > MOVES * np.max(power)
-    square = rest / blocks[0].size  # of what changes from sample to sample: twice the variance of what is white
+    square = rest / -(
+        -values.size // BLOCKS
+    )  # of what changes from sample to sample: twice the variance of what is white
     small = 0.0 < 0.5 * square <= (READING * largest) ** 2
+    blocks = np.array_split(values, BLOCKS) if small else []
     if small and float(np.median([np.var(block) for block in blocks])) <= square:  # white
         means = np.diff([float(np.mean(block)) for block in blocks], prepend=float(np.mean(blocks[0])))
         spread = 1.4826 * float(np.median(np.abs(power - np.median(power))))
@@ -300,6 +302,12 @@ def _find_moves(values: Signal) -> tuple[int, int]:
         moves |= np.abs(means) > max(LOUD * np.sqrt(square / blocks[0].size), MOVES**0.5 * np.max(np.abs(means)))
     moving = np.flatnonzero(moves)
     return (int(moving[0]), int(moving[-1]) + 1) if moving.size and largest > 0.0 else (0, 0)
+
+
+def _sum_blocks(values: Signal) -> Signal:
+    """Return the sums over blocks that are cut as `np.array_split` cuts them."""
+    sizes = values.size // BLOCKS + (np.arange(BLOCKS) < values.size % BLOCKS)
+    return np.add.reduceat(values, np.cumsum(sizes) - sizes)
 
 
 def _follows_small(minimum: Minimum) -> bool:

@@ -165,15 +165,14 @@ def _make_delay(value: float) -> Parameter:
 def find_candidates(problem: FitProblem) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the fixed parameters whose freedom leaves linear plants linear, and those that would not."""
     params = problem.params
+    values = {e.name: e.data.plant.complete(e.data.apply_own(params)) for e in problem.experiments}
     plain: list[str] = []
     bending: list[str] = []
     for name, parameter in params.items():
         users = [e for e in problem.experiments if name in e.data.plant.parameters and name not in e.data.parameters]
         if parameter.free or not users or all(e.data.plant.parameters[name] == GRAVITY for e in users):
             continue  # a constant is not at fault
-        models = (
-            make_model(e.data.plant, e.data.apply_own(params), (*e.model.free, name), e.data.outputs) for e in users
-        )
+        models = (make_model(e.data.plant, values[e.name], (*e.model.free, name), e.data.outputs) for e in users)
         same = all(model.linear == e.model.linear for e, model in zip(users, models, strict=True))
         (plain if same else bending).append(name)
     return tuple(plain), tuple(bending)
