@@ -15,6 +15,7 @@ from scipy.linalg import expm
 
 import seaopt as so
 from seaopt.control import CompensateRipple, add_compensation, export_mpc
+from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.mpc.export import collect_code
 from seaopt.control.mpc.stored import read_code
 from seaopt.files import to_json
@@ -165,6 +166,7 @@ def test_in_c_and_python_the_sum_of_plan_and_terms_is_within_limits(slew, previe
     mpc = replace(mpc, compensation=replace(mpc.compensation, ripple=terms.ripple, friction=friction))
     rows, state, commands = draw_rows(3), mpc.start, []
     assert mpc.compensation.reads == ("theta_m", "theta_l")
+    assert all(getattr(mpc.compensation, name) for name in Compensation.json_keys)  # a new one is to be here, too
     found = run_c(compiler, tmp_path / "code", mpc, rows)
     for wanted, motor, link, reading in rows.tolist():
         command, state = mpc.command(state, wanted, reading, (motor, link))
