@@ -57,7 +57,7 @@ def _compare_by_value(cls: type[Any]) -> dict[str, Any]:
     names = [each.name for each in fields(cls) if each.compare]
     values = attrgetter(*names, "__class__")  # two names at least make it a tuple
 
-    def compare(self: Any, other: object) -> bool:
+    def compare(self: Any, other: object) -> Any:
         return values(self) == values(other) if other.__class__ is self.__class__ else NotImplemented
 
     def hash_values(self: Any) -> int:
