@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 from typer.testing import CliRunner
@@ -15,6 +16,7 @@ import seaopt as so
 from seaopt.cli import main
 from seaopt.cli.main import app
 from seaopt.cli.session import Session
+from seaopt.machine import bring_up
 from tests.cli.test_session import BENCH as FITTED
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
@@ -97,8 +99,9 @@ def test_a_fit_that_is_killed_as_it_is_judged_is_there_and_nobody_takes_it_for_m
     assert whole.met(["fit"]) and whole.results["fit"].parameters["J"].value == inertia["value"]
 
 
-def test_bringup_and_accept_say_that_a_fit_is_not_met(tmp_path, monkeypatch, compiler):
+def test_bringup_and_accept_say_that_a_fit_is_not_met(tmp_path, monkeypatch, compiler, without_simulation):
     """Both took it as met: they exited 0, and no file of theirs had a word of it."""
+    monkeypatch.setattr("seaopt.cli.machine.bring_up", partial(bring_up, fractions=()))  # no slower laws are tuned
 
     def stop(*_, **__):
         raise KeyboardInterrupt

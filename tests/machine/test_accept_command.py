@@ -12,7 +12,9 @@ import seaopt as so
 from seaopt.cli.main import app
 from seaopt.files import write_json
 from seaopt.problem.loop_logs import read_loop_log
+from seaopt.robustness.certificate.simulated import SIMULATIONS
 from tests.c_code import CompiledLog
+from tests.checks import leave_out
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
 
@@ -269,11 +271,12 @@ def test_a_law_without_a_certificate_that_is_met_is_not_accepted(folder, accept,
 SCHEDULED = PROBLEM.replace("9.0 }", '9.0, schedule = { over = "k", points = [5e5, 8e5] } }').replace("= 30", "= 25")
 
 
-def test_a_schedule_is_accepted_at_the_value_that_is_typed(compiler, tmp_path):
+def test_a_schedule_is_accepted_at_the_value_that_is_typed(compiler, tmp_path, monkeypatch):
     from typer.testing import CliRunner
 
     from seaopt.control import ScheduledController
 
+    leave_out(monkeypatch, SIMULATIONS)
     (tmp_path / "stand.toml").write_text(SCHEDULED)
     arguments = [str(tmp_path / "stand.toml"), "-o", str(tmp_path / "out")]
     for command in ("tune", "certify"):
