@@ -467,3 +467,15 @@ def test_a_loop_that_ran_away_is_told_to_check_its_signs(controller, bench):
     assert np.mean(np.abs(log["I"]) > 0.99 * controller.command_limit) > 0.9
     result = so.accept(controller, [log])
     assert "check the signs of command and readings" in " ".join(repr(result).split())
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_interval_of_a_bandwidth_agrees_with_its_outcome(controller, bench, seed):
+    """It ended below the limit that was confirmed: its ends were those of all lines and of one, the wrong way round."""
+    lines = np.unique(np.round(np.geomspace(1, 150, 70)).astype(int))
+    f = np.geomspace(1.0, 150.0, 4000)
+    truth = f[np.abs(respond(Machine(), f, controller, 1)[1]) < np.sqrt(0.5)][0]
+    log = bench.log(Machine(), multisine(1000, lines, 6, 60.0, seed), noise=2.0, seed=seed)
+    row = {each.name: each for each in so.accept(controller, [log]).response.judged}["bandwidth"]
+    assert row.low < truth < row.high and row.outcome == "confirmed"
+    assert row.low >= np.max(lines[lines <= row.limit])

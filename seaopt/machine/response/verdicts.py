@@ -512,8 +512,8 @@ def _judge_bandwidth(
         refuted = refuted or broken.size > 0
         where = float(part.f[broken[0]]) if broken.size else where
         values.append(_find_fall(part.f, middle))
-        lows.append(_find_fall(part.f, bound(part, alpha / m)[0]))
-        highs.append(_find_fall(part.f, bound(part, alpha)[1]))
+        lows.append(_find_fall(part.f, lower))  # which errs at one line, where the fall is
+        highs.append(_find_fall(part.f, upper))  # which errs at any line below it
         open_ = below & (lower < HALF_POWER)
         room = np.maximum(np.abs(middle - HALF_POWER), 1e-300)
         needed = max(needed, float(np.max(((middle - lower) / room)[open_], initial=0.0)) ** 2 * part.periods)
