@@ -177,6 +177,15 @@ def test_the_right_machine_is_accepted(controller, bench):
     assert result.met and result.differences.inside and result.differences.misfit < 2.0, result
 
 
+def test_what_differs_by_less_than_a_machine_and_its_model_is_said_to_do_so(controller, bench):
+    """1 % of the motor's torque without noise: within the 2 % of the response that are allowed, and named."""
+    machine = replace(Machine(), per_ampere=0.99 * Machine().per_ampere)
+    result = so.accept(controller, [bench.log(machine, REFERENCE, noise=0.01)])
+    assert result.met and {result.differences.found[0].name, *result.differences.found[0].alike} & {"eta", "K_tau"}
+    text = " ".join(str(result).split())
+    assert "to 2 % of its response" in text and "may make more: dry friction at a smaller amplitude" in text
+
+
 @pytest.mark.parametrize(
     ("machine", "kind", "name", "value"),
     [

@@ -11,6 +11,7 @@ from seaopt.control import Controller
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.differences.certified import Differences
+from seaopt.machine.differences.comparison import TOLERATED
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.page.figures import list_panels
 from seaopt.machine.page.verdict import OUTCOMES, judge, name_figure, say_inside, say_undecided, show_interval
@@ -96,6 +97,10 @@ SHORT = "; a larger reference comes nearer to what was asked"
 STABILITY = (
     "Stability is the least |1 + L| over the radius of its disc (no unit): above 1 no disc holds zero, where the loop "
     "would be at its limit of stability."
+)
+SLIGHT = (
+    f"The rows are within the {100.0 * TOLERATED:.0f} % of the response by which a machine may be off every certified "
+    "one. Elsewhere they may make more: dry friction at a smaller amplitude."
 )
 ONE_ALONE = "Each row is by itself, in place of the others: shares do not add up."
 NOT_TOLD = "Rows whose shares are alike are not told apart by the log."
@@ -295,7 +300,8 @@ def _remark(differences: Differences) -> tuple[str, ...]:
     """Return how rows of the table of differences are to be read."""
     if not differences.found:
         return ()
-    remarks = [ONE_ALONE] if len(differences.found) > 1 else []
+    remarks = [SLIGHT] if differences.inside else []
+    remarks += [ONE_ALONE] if len(differences.found) > 1 else []
     if any(each.untold for each in differences.found):
         remarks.append(NOT_TOLD)
         if any(each.kind == "drive limit" for each in differences.found):

@@ -6,6 +6,7 @@ from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import EXPLAINED, Acceptance
 from seaopt.machine.causes import Cause
 from seaopt.machine.differences.certified import Differences
+from seaopt.machine.differences.comparison import TOLERATED
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.verdicts import LEAST_PHASES, Judged, Response
 from seaopt.machine.wording import say_cause, say_difference, say_missing, say_status, say_trip
@@ -75,12 +76,12 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
 
 def say_inside(result: Acceptance, differences: Differences) -> str:
     """Return whether the machine is one of those that were certified, or else of what it was compared with."""
-    no = "" if differences.inside else "not "
-    if result.certificate == "met":
-        return f"the machine is {no}one of those that were certified"
     model = "the plant of the link" if result.enclosed else "the design plant"
     given = "within the uncertainty that was given" if differences.nearest else model
-    return f"the machine is {no}{given}"
+    what = "one of those that were certified" if result.certificate == "met" else given
+    if differences.inside:
+        return f"the machine is {what}, to {100.0 * TOLERATED:.0f} % of its response"
+    return f"the machine is not {what}"
 
 
 def _say_best(differences: Differences) -> str:
