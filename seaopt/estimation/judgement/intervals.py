@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.estimation.judgement.second_log import FAR, SECOND, find_excess, has_two_amplitudes
 from seaopt.estimation.problem.experiment import Experiment
@@ -304,7 +305,7 @@ def _find_moves(values: Signal) -> tuple[int, int]:
     return (int(moving[0]), int(moving[-1]) + 1) if moving.size and largest > 0.0 else (0, 0)
 
 
-def _sum_blocks(values: Signal) -> Signal:
+def _sum_blocks(values: Signal) -> Float[np.ndarray, " blocks"]:
     """Return the sums over blocks that are cut as `np.array_split` cuts them."""
     sizes = values.size // BLOCKS + (np.arange(BLOCKS) < values.size % BLOCKS)
     return np.add.reduceat(values, np.cumsum(sizes) - sizes)
