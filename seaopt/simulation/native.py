@@ -51,6 +51,7 @@ THREAD_NAME = "seaopt-native"
 COMPILER_S = 60.0  # time limit of a compiler for one library,
 PER_CHARACTER_S = 5e-4  # and for each character of its source: ten times what an idle machine takes
 HUNG_S = 3_600.0  # for which a compiler that took longer is not asked again
+BUSY = 3.0  # processes that wait for each processor: there a compiler that takes long does not hang
 ORPHAN_S = 3_600.0  # after which nobody waits for the compiler of a folder any more
 BUILD = "build-"  # prefix of those folders
 # Loops are unrolled as by -O3. What is left out of -O2 moves instructions about, after all sums are in their order: the
@@ -185,7 +186,8 @@ def _compile(compiler: list[str], source: str, name: str, folder: Path, key: str
     except subprocess.TimeoutExpired as error:
         trouble = f"did not end within {error.timeout:.2g} s"
         with suppress(OSError):
-            hung.touch()
+            if os.getloadavg()[0] < BUSY * (os.cpu_count() or 1):
+                hung.touch()
     except OSError as error:  # no room on the disk, among others
         trouble = error.strerror or str(error)
     _warn_once(f"C compiler {' '.join(compiler)}: {trouble}; slower without it; SEAOPT_COMPILER names another, or none")

@@ -257,6 +257,7 @@ def test_a_compiler_that_hangs_is_asked_once(kernels, make_compiler, monkeypatch
     """It and what it started are killed; the next process does not wait again."""
     make_compiler(f'echo asked >> "{tmp_path}/asked"; sleep 30 & wait')
     monkeypatch.setattr(native, "COMPILER_S", 0.3)
+    monkeypatch.setattr(native.os, "getloadavg", lambda: (1.0, 1.0, 1.0))
     begin = time.monotonic()
     assert native.load_library(ANSWER % "hangs", "answer") is None
     (line,) = caplog.messages
@@ -272,6 +273,17 @@ def test_a_compiler_that_hangs_is_asked_once(kernels, make_compiler, monkeypatch
         os.utime(marker, (day, day))
         assert native.load_library(ANSWER % f"another day, {asked}", "answer") is None
         assert (tmp_path / "asked").read_text(encoding="utf-8").count("asked") == asked
+
+
+def test_a_compiler_that_a_busy_machine_holds_up_is_asked_again(kernels, make_compiler, monkeypatch, tmp_path):
+    """It was not asked for an hour, by everybody who shares the cache."""
+    make_compiler(f'echo asked >> "{tmp_path}/asked"; sleep 30 & wait')
+    monkeypatch.setattr(native, "COMPILER_S", 0.3)
+    monkeypatch.setattr(native.os, "getloadavg", lambda: (10.0 * os.cpu_count(), 1.0, 1.0))
+    for time_asked in (1, 2):
+        assert native.load_library(ANSWER % f"held up {time_asked}", "answer") is None
+        assert (tmp_path / "asked").read_text(encoding="utf-8").count("asked") == time_asked
+    assert not list(kernels.glob("*.hung"))
 
 
 @needs_compiler
