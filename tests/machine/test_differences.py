@@ -244,3 +244,20 @@ def test_the_joint_probability_of_what_is_left_is_the_one_that_is_stated(control
         lines.response, lines.std, lines.ratios = ratio.value, ratio.std, [ratio]
         refused += not explains(lines, truth, alpha)
     assert abs(refused / 2000 - alpha) < 0.025
+
+
+@pytest.mark.parametrize("noise", [1.0, 2.0])
+def test_a_gain_that_no_line_shows_by_itself_is_outside_of_what_was_certified(controller, bench, noise):
+    """4 % of the motor's torque, of 0.25 % that were certified, was "one of those that were certified", and its row
+    said 0.96 (0.952 to 0.968).
+    """
+    for seed in (1, 2):
+        machine = replace(Machine(), per_ampere=0.96 * Machine().per_ampere)
+        log = bench.log(machine, REFERENCE, noise=noise, seed=seed)
+        ranges = {"eta": (0.9975, 1.0025)}
+        result = so.accept(controller, [log], uncertainty=so.plants.thor(), ranges=ranges)
+        first = result.differences.found[0]
+        assert not result.differences.inside and not result.met, first
+        assert {"eta", "K_tau", "gain"} & {first.name, *first.alike} and first.low <= 0.96 <= first.high
+        right = bench.log(Machine(), REFERENCE, noise=noise, seed=seed)
+        assert so.accept(controller, [right], uncertainty=so.plants.thor(), ranges=ranges).differences.inside

@@ -2,7 +2,9 @@
 
 **Inside what was certified** is a machine whose response at every line is no further from the nominal one than a draw
 of the certificate is, but for the disc of the measurement and 2 % of the response, and of which one machine within the
-spread of the draws explains all lines together (`joint`). The nearest draw is the one of the least misfit, sum over the
+spread of the draws explains all lines together (`joint`). It is not where the best cause, at that end of its interval
+where it does least, takes a line further than that: one size out of all lines tells what none of them does by itself.
+The nearest draw is the one of the least misfit, sum over the
 lines of the square of what it is off by, over the measurement's std.
 
 A sensor is at its range where readings pile up at an edge of what was read while the command moves on.
@@ -14,9 +16,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from seaopt.control import Controller
-from seaopt.machine.differences.comparison import TOLERATED, Comparison
+from seaopt.machine.differences.comparison import TOLERATED, Comparison, Lines
 from seaopt.machine.differences.explanations import explain
 from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
@@ -25,6 +28,7 @@ from seaopt.machine.response.judged import Measured, Prediction
 from seaopt.machine.response.periods import shorten
 from seaopt.machine.response.verdicts import has_dry_friction, predict_response
 from seaopt.machine.ticks import Ticks, find_edges
+from seaopt.parameters import ParameterSet
 from seaopt.records import record
 from seaopt.robustness.uncertainty.worst import place_values
 
@@ -93,9 +97,10 @@ def compare(
     best = int(np.argmin(misfits)) if misfits else None
     each_line = bool(np.all(share <= TOLERATED))
     together = is_one_of(comparison, spread, [model, *drawn], 1.0 - confidence) if each_line else False
+    beyond = together and bool(found) and _is_beyond(comparison, values, found[0], model, reach)
     worst = int(np.argmax(share))
     return Differences(
-        inside=together and not flat,
+        inside=together and not flat and not beyond,
         each_line=each_line,
         misfit=before / count,
         most_noise=comparison.most_noise,
@@ -106,6 +111,30 @@ def compare(
         nearest_misfit=None if best is None else misfits[best] / count,
         prediction=predict_response(controller, simulated) if dry else None,
     )
+
+
+def _is_beyond(
+    comparison: Comparison,
+    values: ParameterSet,
+    best: Difference,
+    model: Lines,
+    reach: Float[np.ndarray, " m"],
+) -> bool:
+    """Tell whether the best cause, with the least of it that its interval has, is more than certified machines have.
+    `reach`: of their responses from the model's.
+    """
+    low, high, explained = best.low, best.high, (best.left or 0.0) <= comparison.most_noise
+    if best.kind not in ("gain", "parameter") or best.beside or not explained or low is None or high is None:
+        return False
+    if low <= 1.0 <= high:
+        return False
+    least = low if low > 1.0 else high
+    if best.kind == "gain":
+        changed = least * model
+    else:
+        parameter = comparison.plant.complete(values)[best.name]
+        (changed,) = comparison.predict([values.with_parameters(replace(parameter, value=least * parameter.value))])
+    return bool(np.any(np.abs(changed - model) - reach > TOLERATED * np.abs(model)))
 
 
 def _list_beside(measured: Sequence[Measured], signals: Sequence[str]) -> tuple[str, ...]:
