@@ -221,16 +221,19 @@ def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(t
 
 
 def test_what_cannot_be_played_is_refused(controller, plan):
+    def unused(law):
+        raise AssertionError("a law was certified")
+
     options = {"plants": {"stand": so.plants.high_impedance()}, "uncertainty": so.plants.thor(), "samples": 5}
     options["certificate"] = plan.stages[-1].certificate
     for wrong, says in (
         ({"fractions": (1.5,)}, "between 0 and 1"),
         ({"share": 0.0}, "share = 0"),
         ({"fractions": (), "bias": 5000.0}, "bias = 5000"),
-        ({"fractions": (), "limits": {"f1": 900.0}}, "limits names f1; known: I, F1"),
+        ({"certificate": None, "limits": {"f1": 900.0}}, "limits names f1; known: I, F1"),  # before a law is certified
     ):
         with pytest.raises(so.SeaoptError, match=says):
-            so.bring_up(controller, **options, **wrong)
+            so.bring_up(controller, certify_stage=unused, **options | wrong)
 
 
 def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_whole_run():

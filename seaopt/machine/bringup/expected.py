@@ -15,6 +15,7 @@ from seaopt.control.loops.moved_link import MOVED, find_position
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.running.closed_loop import LoopRun
 from seaopt.control.scheduling.scheduled_controller import place_variable
+from seaopt.errors import ControlError, suggestion
 from seaopt.machine.bringup.excitation import Excitation, design_excitation
 from seaopt.machine.design_run import run_design
 from seaopt.machine.response.enclosed import enclose_outer
@@ -159,13 +160,17 @@ def find_noise(controller: Controller, options: Mapping[str, Any]) -> float:
 def split_limits(
     controller: Controller, limits: Mapping[str, float], link: tuple[Plant, ParameterSet] | None
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the limits of the law alone, and of it with its outer loop on the plant of its link; what neither plant
-    has is left to be refused.
+    """Return the limits of the law alone, and of it with its outer loop on the plant of its link. Raises ControlError:
+    neither plant has such a signal.
     """
-    if controller.outer is None or link is None or controller.design is None:
-        return dict(limits), {}
-    own, other = (controller.see(plant).outputs for plant in (controller.design[0], link[0]))
-    alone = {name: value for name, value in limits.items() if name in own or name not in other}
+    assert controller.design is not None
+    own = {controller.command.input, *filter(None, controller.see(controller.design[0]).outputs)}
+    other = set[str]() if controller.outer is None or link is None else {*controller.see(link[0]).outputs}
+    for name in limits:
+        if name not in own | other:
+            known = sorted(own | other, key=lambda each: (each != controller.command.input, each))
+            raise ControlError(f"limits names {name}; {suggestion(name, known)}")
+    alone = {name: value for name, value in limits.items() if name in own}
     return alone, {name: value for name, value in limits.items() if name in other}
 
 
