@@ -15,6 +15,7 @@ from seaopt.problem.problem import Problem
 from seaopt.problem.reading import make_problem
 from seaopt.problem.schema import ProblemTable
 
+PART = 0.5  # of the residual's excess: what leaves less of it may be true, beside more
 DIGITS = 6  # of the values from which the changed problem's fit starts: a wave number has to hold over all waves
 
 
@@ -39,10 +40,17 @@ def say_unexplained(trials: Sequence[HypothesisTrial]) -> str:
     if not decided:
         return f"nothing explains the logs{stiff}"
     best, count = min(decided, key=lambda trial: trial.excess), len(decided)
+    listed = ", ".join(f'"{part}"' for part in best.parts)
+    more = (
+        "; where three effects or more are there these may be some of them: add the parts that you know the actuator "
+        f"to have to parts = [{listed}], and fit again; or"
+        if best.excess < PART * best.excess_before
+        else ";"
+    )
     return (
         f"nothing explains the logs: of {count} causes and pairs that were tried the best, {best.effect}, leaves "
-        f"{best.excess:.3g} times the sensor's noise of {best.excess_before:.3g}; look for what is not among them, "
-        f"such as a bench that shakes, another load, or a wrong unit{stiff}"
+        f"{best.excess:.3g} times the sensor's noise of {best.excess_before:.3g}{more} look for what is not among "
+        f"them, such as a bench that shakes, another load, or a wrong unit{stiff}"
     )
 
 

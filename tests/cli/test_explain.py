@@ -66,6 +66,9 @@ def test_what_nothing_explains_is_said():
         frees={"k_3": 1.0}, fixed={}, parameters={}, evaluations=9,
     )  # fmt: skip
     trials = (trial, replace(trial, effect="the motor cogs", excess=12.0))
+    assert "three effects" not in say_unexplained(trials[:1]) and "look for what is not" in say_unexplained(trials[:1])
+    assert "these may be some of them: add the parts" in say_unexplained(trials)
+    assert 'to parts = ["hardening"], and fit again; or look for what is not' in say_unexplained(trials)
     assert "nothing was tried" in say_unexplained(())
     assert "the best, the motor cogs, leaves 12 times the sensor's noise of 30" in say_unexplained(trials)
     tied = tuple(replace(each, outcome="tied") for each in trials)
