@@ -420,7 +420,7 @@ class Program:
         """Tell whether each part begins where the one before ends."""
         reached = (self._read_derivatives(end)[:, 0] for end in parts.ends)
         pairs = zip(reached, parts.starts[1:], parts.gram[1:], strict=False)
-        return all(moves_little(start - end, gram, self.layout) for end, start, gram in pairs)
+        return all(moves_little(start, end, gram, self.layout) for end, start, gram in pairs)
 
     @np.errstate(all="ignore")  # a plant that overflows
     def _join(self, parts: _Parts) -> Pass:

@@ -74,8 +74,11 @@ def join_parts(reached: Sequence[Float[np.ndarray, "nx nj"]], layout: Layout) ->
     return joins
 
 
-def moves_little(miss: VectorX, grams: Float[np.ndarray, "ny nc nc"], layout: Layout) -> bool:
-    """Tell whether a state that is so much off moves no output's residuals by more than they tell."""
-    at = np.arange(layout.start.start, layout.start.stop)
-    moved = np.sqrt(grams[:, at, at]) @ np.abs(miss)
-    return bool(np.all(moved <= TOLERANCE * np.sqrt(grams[:, 0, 0])))
+def moves_little(start: VectorX, end: VectorX, grams: Float[np.ndarray, "ny nc nc"], layout: Layout) -> bool:
+    """Tell whether a part may begin in a state in place of that in which the part before it ends: it moves no output's
+    residuals by more than they tell, and is the same where an output was not measured, which tells nothing.
+    """
+    at, miss = np.arange(layout.start.start, layout.start.stop), np.abs(start - end)
+    moved, power = np.sqrt(grams[:, at, at]) @ miss, grams[:, 0, 0]
+    same = bool(np.all(miss <= TOLERANCE * np.abs(end)))
+    return bool(np.all((moved <= TOLERANCE * np.sqrt(power)) & ((power > 0.0) | same)))

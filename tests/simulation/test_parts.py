@@ -169,3 +169,14 @@ def test_passes_that_are_kept_are_those_that_are_not(damping: float, friction: f
     alone = run_passes(program.model, program.segment, moved, X0)
     assert second.loss == pytest.approx(alone.loss, rel=1e-11)
     assert second.loss != pytest.approx(first.loss, rel=1e-6)
+
+
+def test_a_part_without_a_measured_sample_begins_where_the_one_before_ends():
+    """What is not measured tells nothing of a wrong state there: outputs were off by twice their size."""
+    program, point = make_program(1.0, 0.0)  # forgets nothing
+    measured = (np.arange(program.segment.n) < 0.1 * program.segment.n).astype(np.uint8)
+    segment = replace(program.segment, keep=(measured,))
+    with keep_passes():
+        found = run_passes(program.model, segment, point, X0, outputs=True, columns=True, keep=True)
+    expected = run_passes(program.model, segment, point, X0, outputs=True)  # in one piece
+    np.testing.assert_allclose(found.outputs, expected.outputs, rtol=1e-8, atol=1e-6)

@@ -38,7 +38,7 @@ MOVES = 0.01  # of the block in which an input moves the most
 LOUD = 6.0  # standard deviations of a reading's noise in a block, above which it moves
 FOLLOWED = 30.0  # standard deviations by which the outputs follow what is small: a tenth off is three of them off
 MORE = 1.5  # times the variance by white noise of its size, that rounding makes of a value: worth a word
-ENOUGH = 10.0  # of log-likelihood, over the colour of the residual: a gain that chance does not give
+CHANCE = 4.5e-5  # with which a log's residual falls by chance as far as is taken for a wrong state at its start
 HALF = 0.5  # of a residual's power: what leaves less is another explanation, wherever the values are
 FAINT = 1e-6  # of an output's spread: a residual that is less is no motion
 ROUNDING = 1e-12  # of what an unknown does: less of it left is rounding
@@ -156,12 +156,13 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
     if not stated or fit.status != "converged":
         return
     freed, at = problem.rebuild(problem.params, minimum.z, stated)
-    freed = copy_steps(freed, problem)
+    freed, states = copy_steps(freed, problem), dict.fromkeys(stated, 0)
     for old, new in zip(problem.experiments, freed.experiments, strict=True):
         for before, after in zip(old.segments, new.segments, strict=True):
             for known, slot in zip(before.initial, after.initial, strict=True):
                 if slot.index is not None:
                     at[slot.index] = known.at(minimum.z)
+                    states[old.name] += 1
     first = freed.evaluate(at)
     if not np.all(np.isfinite(first.hessian)):
         return
@@ -179,7 +180,10 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
         before, after = fitted[name].rms, best.power[name].rms
         falls = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
         # Of simulated logs without noise the residual is rounding, and the integration's error.
-        if float(fitted[name].counts @ falls) < ENOUGH * colour or np.max(before * sizes) < FAINT:
+        from scipy.special import chdtri  # deferred: 0.1 s
+
+        enough = 0.5 * float(chdtri(states[name], CHANCE)) * colour  # each state that is freed takes some away
+        if float(fitted[name].counts @ falls) < enough or np.max(before * sizes) < FAINT:
             continue
         gone = 1.0 - math.exp(-2.0 * float(np.max(falls)))
         most = max(beyond, key=lambda n: beyond[n] / max(abs(values[n]), 1e-300), default="")
@@ -294,7 +298,7 @@ def _find_moves(values: Signal) -> tuple[int, int]:
     square = rest / -(
         -values.size // BLOCKS
     )  # of what changes from sample to sample: twice the variance of what is white
-    small = 0.0 < 0.5 * square <= (READING * largest) ** 2
+    small = values.size > BLOCKS and 0.0 < 0.5 * square <= (READING * largest) ** 2
     blocks = np.array_split(values, BLOCKS) if small else []
     if small and float(np.median([np.var(block) for block in blocks])) <= square:  # white
         means = np.diff([float(np.mean(block)) for block in blocks], prepend=float(np.mean(blocks[0])))
@@ -308,6 +312,8 @@ def _find_moves(values: Signal) -> tuple[int, int]:
 def _sum_blocks(values: Signal) -> Float[np.ndarray, " blocks"]:
     """Return the sums over blocks that are cut as `np.array_split` cuts them."""
     sizes = values.size // BLOCKS + (np.arange(BLOCKS) < values.size % BLOCKS)
+    if values.size < BLOCKS:  # some of them are empty, of which reduceat makes what follows them
+        return np.array([float(np.sum(block)) for block in np.array_split(values, BLOCKS)])
     return np.add.reduceat(values, np.cumsum(sizes) - sizes)
 
 

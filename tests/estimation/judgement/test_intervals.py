@@ -270,3 +270,15 @@ def test_a_component_of_cogging_is_known_over_the_size_of_both(half, severity):
     wide = np.diag(np.square([std * (name == "b_g") for name in names]))
     found = list(find_rough(widen(fit, wide), matters))
     assert [(each.kind, each.where) for each in found] == ([(severity, "b_g")] if severity else [])
+
+
+def test_a_short_log_beside_a_step_is_judged():
+    """Of 60 rows some of the 64 blocks that look for events are empty."""
+    rng = np.random.default_rng(3)
+
+    def step(rows, name):
+        u = np.where(np.arange(rows) > 0.4 * rows, 1.0, 0.0) + 1e-3 * rng.normal(size=rows)
+        log = so.Log.from_arrays(time=np.arange(rows) * PERIOD, u=u, y=2.0 * u + 0.01 * rng.normal(size=rows))
+        return so.Experiment(plant=GAIN, log=log, initial_state="rest", offset=False, name=name)
+
+    assert "event" in list_kinds(fit(step(1500, "long"), step(60, "short")), "error")

@@ -77,3 +77,16 @@ def test_a_little_motion_at_the_start_is_noticed_under_much_noise():
 def test_a_log_that_begins_at_rest_is_met(seed, noise):
     right = fit(record(seed, noise=noise))
     assert right.met and not find_initial(right)
+
+
+def test_a_log_in_pieces_that_all_begin_at_rest_is_not_blamed():
+    """With twelve pieces 24 states are freed, which by chance take 12 of log-likelihood away."""
+    for seed in range(4):
+        pieces, begin = [record(50 * seed + k, seconds=1.0) for k in range(12)], 0.0
+        times = list[np.ndarray]()
+        for piece in pieces:
+            times.append(piece.time + begin)
+            begin += float(piece.time[-1]) + 0.5
+        columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in ("I", "theta_m")}
+        log = so.Log.from_arrays(time=np.concatenate(times), **columns)
+        assert not find_initial(fit(log)), seed
