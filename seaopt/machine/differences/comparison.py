@@ -3,8 +3,8 @@
 With dry friction the model's response is that of the same law on the nonlinear plant, simulated under the logged
 reference and cut as the log is, since it depends on amplitude; two periods of each set of phases do. Noise of what the
 law reads, which is in its command, shakes the motor through its friction: where it makes much of the command the model
-has as much of it, twice, once turned about zero. In the mean of both what noise adds to the lines is gone, and what it
-makes of friction is left.
+has as much of it, twice, once turned about zero. In the mean of both what noise adds to the lines is gone to first
+order, and what it makes of friction is left; that depends on the noise, of which one draw is taken.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class Comparison:
         if not has_dry_friction(self.controller) or find_noise_share(self.controller, ticks) < SHAKES:
             return run_design(source, sets, reference, rate=self.rate).outputs
         noise = dict(zip(self.controller.signals, measure_noise(ticks), strict=True))
-        sensors = Sensors(noise_std={name: std for name, std in noise.items() if name in source.signals})
+        sensors = Sensors(noise_std={name: std for name, std in noise.items() if name in self.plant.outputs})
         gains = np.repeat([1.0, -1.0], len(sets))
         both = run_design(source, [*sets, *sets], reference, sensors=sensors, noise_gain=gains, rate=self.rate)
         return {name: rows.reshape(2, len(sets), -1).mean(axis=0) for name, rows in both.outputs.items()}
