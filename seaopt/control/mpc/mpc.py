@@ -317,7 +317,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
         added = terms[1] * self.per_effort  # which the model has no part of, nor of the friction that it meets
         corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
         drift, before = float(ahead[-1]), last - state.terms[1] * self.per_effort
-        u_s, targets = self._targets(drift, references, most)
+        u_s, targets = self._targets(drift, references, -most - added, most - added)
         xi = ahead[: self.rest_state.size] - self.rest_state * (u_s + drift)
         q, low, high = self.program(xi, u_s, before, drift, targets, most)
         shifted = self.shift @ state.plan
@@ -393,9 +393,11 @@ class ForceMPC(ClosesLoops, Result, Worded):
             ahead = self.kalman.advance(ahead, older, newer)
         return corrected, innovation, ahead
 
-    def _targets(self, drift: float, references: Float[np.ndarray, " p"], most_A: float) -> tuple[float, References]:
+    def _targets(
+        self, drift: float, references: Float[np.ndarray, " p"], least_A: float, most_A: float
+    ) -> tuple[float, References]:
         """Return the current at rest for the last reference, and the nearest forces to all that the limits can hold."""
-        ends = self.prediction.outputs.admissible_rest(drift, most_A)
+        ends = self.prediction.outputs.admissible_rest(drift, least_A, most_A)
         currents = np.clip(references / self.static_gain - drift, *ends)
         first = min(self.kalman.delay_samples, references.size - 1)
         return float(currents[-1]), self.static_gain * (currents[first:] + drift)

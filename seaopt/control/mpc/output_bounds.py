@@ -67,16 +67,16 @@ class OutputBounds:
         none = np.full(base.size, wide)
         return (np.concatenate([-none, -1.0 - base, np.zeros(k)]), np.concatenate([1.0 - base, none, np.full(k, wide)]))
 
-    def admissible_rest(self, drift: float, limit: float) -> tuple[float, float]:
-        """Return the commands at rest, least and largest, that keep the bounds; within the limit of the command. Where
+    def admissible_rest(self, drift: float, least: float, most: float) -> tuple[float, float]:
+        """Return the commands at rest, least and largest, that keep the bounds; within the ends of the command. Where
         no command keeps them all, it is the one that breaks them least.
         """
         if not self.names:
-            return -limit, limit
+            return least, most
         moves = np.abs(self.static) > 0.0
         ends = (self.middle[moves] / self.half[moves] + np.array([[-1.0], [1.0]])) / self.static[moves] - drift
-        low = float(np.clip(np.max(np.min(ends, axis=0), initial=-limit), -limit, limit))
-        high = float(np.clip(np.min(np.max(ends, axis=0), initial=limit), -limit, limit))
+        low = float(np.clip(np.max(np.min(ends, axis=0), initial=least), least, most))
+        high = float(np.clip(np.min(np.max(ends, axis=0), initial=most), least, most))
         middle = 0.5 * (low + high)
         return (low, high) if low <= high else (middle, middle)
 

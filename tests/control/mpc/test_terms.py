@@ -259,3 +259,15 @@ def test_files_and_pickles_keep_it(tmp_path):
     assert "80 % of the link's weight, by theta_l" in repr(law)
     assert code.parts.keys() == {"terms.h", "outer.h"}
     assert not collect_code(replace(mpc, compensation=None, outer=None)).parts
+
+
+@pytest.mark.parametrize(("added", "needed", "aimed"), [(-3.0, 10.5, 10.5), (3.0, 8.0, 6.0), (-3.0, 13.0, 12.0)])
+def test_at_rest_the_sum_of_plan_and_terms_is_what_the_limit_is_of(added, needed, aimed, tmp_path, monkeypatch):
+    """Of 9 A, beside -3 A a plan may rest at 12 A, and beside 3 A at 6 A."""
+    mpc = plan(tmp_path, FROM_REFERENCE)
+    monkeypatch.setattr(
+        "seaopt.control.mpc.mpc.add_terms",
+        lambda terms, last, references, readings: (0.0, added / mpc.per_effort, last[2]),
+    )
+    step = mpc.step(mpc.start, needed * mpc.static_gain, 0.0, ())
+    assert step.target_N == pytest.approx(aimed * mpc.static_gain)

@@ -111,10 +111,10 @@ static real row(const real *theta, int i) {
 #endif
 }
 
-/* Ends of the commands at rest that keep the bounds of signals: the least and the largest. */
-static void admissible_rest(real limit, real drift, real *low, real *high) {
-  *low = -limit;
-  *high = limit;
+/* Ends of the commands at rest that keep the bounds of signals, within given ones: the least and the largest. */
+static void admissible_rest(real bottom, real top, real drift, real *low, real *high) {
+  *low = bottom;
+  *high = top;
 #if SIGNALS
   for (int i = 0; i < SIGNALS; i++) {
     if (mpc_static[i] == 0) continue;
@@ -123,8 +123,8 @@ static void admissible_rest(real limit, real drift, real *low, real *high) {
     if (least > *low) *low = least;
     if (most < *high) *high = most;
   }
-  *low = clip(*low, -limit, limit);
-  *high = clip(*high, -limit, limit);
+  *low = clip(*low, bottom, top);
+  *high = clip(*high, bottom, top);
   if (*low > *high) *low = *high = (*low + *high) / 2;
 #endif
   (void)drift;
@@ -232,7 +232,6 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   s->limit = cool_command(s->rise_winding, s->rise_case);
   if (!(s->limit < (double)mpc_limit)) s->limit = (double)mpc_limit;
 #endif
-  admissible_rest(limit_of(s), drift, &least, &most);
   real last = s->reference, rest = 0, weight = 0, added = 0;
 #if FORCE_MPC_TERMS
   weight = s->weight;
@@ -241,6 +240,7 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
 #if FORCE_MPC_GATE
   if (s->refused > FORCE_MPC_MAX_HELD) added = 0;
 #endif
+  admissible_rest(-limit_of(s) - added, limit_of(s) - added, drift, &least, &most);
 #if FORCE_MPC_PREFILTER
   real shaped[FORCE_MPC_PREFILTER];
   memcpy(shaped, s->shaped, sizeof shaped);
