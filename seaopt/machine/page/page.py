@@ -55,8 +55,8 @@ ENCLOSED = (
     "what was certified there. Of how it tracks a force nothing is asked."
 )
 NO_MARGIN = (
-    "The log does not tell the {}: its interval would be nearly as wide as the margin itself. {} decides; lines that "
-    "lie closer about it help, too."
+    "The log does not tell the {}: its interval would be 1.5 times as wide as the margin itself, or wider. {} would "
+    "tell it; lines that lie closer about it help, too."
 )
 ONE_BY_ONE = "Each line by itself is within reach of some such machine, but none of them explains all lines together."
 RATE = (
