@@ -46,7 +46,7 @@ def test_a_compiler_changes_no_fit(stand, thor, monkeypatch):
     bench = so.Experiment(plant=stand, log=log, outputs=("F1", "F2"))
     free = thor.update(J=3e-6).free("J", "b_r")
     fast = so.fit([bench], free, method=so.OutputError(search=False))
-    monkeypatch.setattr(compiled.Program, "make", lambda *_: None)
+    monkeypatch.setattr(compiled.Program, "make", lambda *_, **__: None)
     slow = so.fit([bench], free, method=so.OutputError(search=False))
     for name in ("J", "b_r"):
         assert fast.parameters[name].value == pytest.approx(slow.parameters[name].value, rel=1e-6)

@@ -234,7 +234,7 @@ quantisation = { F1 = 0.5 }
 """
     (experiment,) = so.read_problem(write(text)).experiments()
     assert experiment.quantisation == {"F1": 0.5}
-    with pytest.raises(so.SeaoptError, match=r"they are 0\.5"):
+    with pytest.raises(so.SeaoptError, match=r"readings are 0\.5 N apart"):
         so.read_problem(write(text.replace("0.5 }", "0.3 }"))).experiments()
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, replace
 from functools import partial
-from itertools import combinations, product, zip_longest
+from itertools import combinations, zip_longest
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -39,8 +39,7 @@ from seaopt.units import ROTARY, mechanics_of, unit_after
 MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
 SHARPER = 0.1  # times the speed that friction is smoothed over, below which it is a jump
 SAME_EFFECT = 1e-3  # of a test's figures, by which parameters that act alike may differ
-# Parts that read an output through a low-pass, its frequency, and of how many poles it is
-FILTERS = (("load_cell", "load_cell_hz", ""), ("sensor_filter", "sensor_filter_hz", " of second order"))
+POLES = ("load_cell_hz", "sensor_filter_hz")  # of the parts that read an output through a low-pass
 LEAD = 40  # samples that signals are shifted by so that a delay may be negative
 UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
 LIKELY_GAINS = (0.05, 20.0)  # of sensors that are not of another unit
@@ -413,33 +412,34 @@ def find_clipping(model: Signal, measured: Signal) -> tuple[float, float, float,
 
 
 def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
-    """Yield the outputs as read through a low-pass, all of them or one: of one pole, then of two."""
+    """Yield the outputs as read through a pole, all of them or one."""
     first = experiments[0]
-    filtered = any(name in first.plant.parameters for _, name, _ in FILTERS)
+    filtered = any(name in first.plant.parameters for name in POLES)
     if filtered or any(e.plant is not first.plant for e in experiments):
         return
     regulated = () if first.plant.sensing is None else first.plant.sensing.regulated
     read = [name for name in first.outputs if name in regulated]
     fastest = FASTEST_POLE * 0.5 / first.log.period
-    groups = [read, *([name] for name in read if len(read) > 1)] if read else []
-    for group, (part, pole, order) in product(groups, FILTERS):
-        plant, names = wrapped(first.plant, (part,), outputs=group), join_words(group)
+    for group in [read, *([name] for name in read if len(read) > 1)] if read else []:
+        plant, names = wrapped(first.plant, ("load_cell",), outputs=group), join_words(group)
 
-        def describe(values: Values, stds: Values, made: tuple[str, ...] = (names, part, pole, order)) -> str | None:
-            names, part, pole, order = made
-            if values[pole] > fastest:
+        def describe(values: Values, stds: Values, names: str = names) -> str | None:
+            cut = values[POLES[0]]
+            if cut > fastest:
                 return None
-            passed = f"{names} passed a low-pass{order} of {values[pole]:.3g} Hz"
-            return f"{passed}; log it unfiltered, or add the part {part}"
+            return (
+                f"{names} passed a low-pass of {cut:.3g} Hz; log it unfiltered, or add the part load_cell, or "
+                "sensor_filter where it has two poles"
+            )
 
         # The faster a pole, the more integration steps it takes: its range ends soon after what is said of it.
-        start = {"value": 0.3 * fastest / FASTEST_POLE, "free": True, "max": 2.0 * fastest}
+        default = plant.complete(params)[POLES[0]]
+        pole = replace(default, value=0.3 * fastest / FASTEST_POLE, free=True, max=2.0 * fastest)
         yield Candidate(
             where=names,
             experiments=tuple(replace(e, plant=plant) for e in experiments),
-            params=params.with_parameters(replace(plant.complete(params)[pole], **start)),
+            params=params.with_parameters(pole),
             says=describe,
-            further=bool(order),
         )
 
 

@@ -55,7 +55,7 @@ STRAIGHT = 1e-12  # 1/A^2: a torque constant that droops less does not droop at 
 
 
 def _fall_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
-    return (declare("a_v", 0.0, f"s/{effort.position}", 0.0, "share of torque that is lost, over the speed"),)
+    return (declare("a_v", 0.0, f"s/{effort.position}", -math.inf, "share of torque that is lost, over the speed"),)
 
 
 def _drift_parameters(effort: Mechanics) -> tuple[Parameter, ...]:

@@ -83,12 +83,8 @@ def test_an_honest_log_is_met_and_explained_as_far_as_its_noise_allows(seed):
         ),
         (lambda c: {"I": c["I"][2:], "F1": c["F1"][:-2], "F2": c["F2"][:-2]}, r"a delay of (4\.9\d+|5|5\.0\d+) ms"),
         (lambda c: c | {"F1": signal.lfilter([0.27], [1.0, -0.73], c["F1"])}, "F1 passed a low-pass of "),
-        (
-            lambda c: c | {"F1": signal.lfilter(*signal.butter(2, 20.0, fs=400.0), c["F1"])},
-            "F1 passed a low-pass of second order of (19|20)",
-        ),
     ],
-    ids=["swapped", "forces swapped", "sign", "pounds", "milliampere", "late input", "delay", "low-pass", "two poles"],
+    ids=["swapped", "forces swapped", "sign", "pounds", "milliampere", "late input", "delay", "low-pass"],
 )
 def test_the_cause_of_a_spoiled_log_is_named(spoil, said):
     result = fit(spoil(bench(noise_n=2.0)))
