@@ -58,7 +58,7 @@ class Ratio:
         """How far from zero what is divided by is, over how far makes it sure; it grows with the root of the blocks."""
         mean, p = self.denominator.mean(axis=0), self.blocks
         spread = np.sqrt(np.sum(np.abs(self.denominator - mean) ** 2, axis=0) / (p * (p - 1)))
-        return np.abs(mean) / (SURE * spread + EXACT * np.abs(mean) + np.finfo(float).tiny)
+        return np.abs(mean) / np.maximum(SURE * spread, EXACT * np.abs(mean) + np.finfo(float).tiny)
 
     @property
     def sure(self) -> Bool[np.ndarray, " m"]:
