@@ -311,8 +311,6 @@ def _project(of_inputs: Complex[np.ndarray, "f m m"], across: Complex[np.ndarray
     """
     size = np.sqrt(np.einsum("fmm->fm", np.real(of_inputs)))
     size = np.where(size > SILENT * np.max(size, axis=0), size, np.inf)
-    if size.shape[1] == 1:
-        return welch.square(across[:, 0] / size)
     values, vectors = np.linalg.eigh(of_inputs / (size[:, :, None] * size[:, None, :]))
     inside = np.conj(np.swapaxes(vectors, 1, 2)) @ (across / size[:, :, None])
     values = np.where(values > ALIKE, values, np.inf)

@@ -62,13 +62,15 @@ def guess_from_responses(problem: FitProblem, rng: np.random.Generator) -> tuple
     every = (unknowns.start, unknowns.low, unknowns.high, unknowns.prior_std)
     start, low, high, prior_std = (values[: unknowns.shared] for values in every)
     spread = np.isinf(prior_std) & (start != 0.0)
-    refined = _refine(targets, start[None], low, high, spread)
+    refined = [_refine(targets, start, low, high, spread)]
     enough = 0.5 * EXPLAINED_MISFIT**2 * 2 * sum(int(np.count_nonzero(target.weight)) for target in targets)
     if refined[0][0] > enough:
-        factors = 10.0 ** rng.uniform(-1.2, 1.2, (CANDIDATES, start.size))
-        candidates = np.clip(start * np.where(spread, factors, 1.0), low, high)
-        ranked = np.argsort(_misfit(targets, candidates)[0], kind="stable")
-        refined += _refine(targets, candidates[ranked[:REFINED_CANDIDATES]], low, high, spread)
+        candidates = [
+            np.clip(start * np.where(spread, 10.0 ** rng.uniform(-1.2, 1.2, start.size), 1.0), low, high)
+            for _ in range(CANDIDATES)
+        ]
+        ranked = np.argsort(_misfits(targets, candidates), kind="stable")
+        refined += [_refine(targets, candidates[k], low, high, spread) for k in ranked[:REFINED_CANDIDATES]]
     refined.sort(key=lambda pair: pair[0])
     guesses = [np.concatenate([theta, unknowns.start[unknowns.shared :]]) for _, theta in refined]
     return guesses, refined[0][0] <= enough
@@ -95,7 +97,7 @@ def _measure_targets(experiment: FitExperiment, params: ParameterSet, theta: Par
         return
     for name, estimates in zip(active, estimated, strict=True):
         target = _choose_target(experiment, params, name, dict(zip(whole, estimates, strict=True)))
-        if target is not None and (len(active) == 1 or np.isfinite(_misfit([target], theta[None])[0][0])):
+        if target is not None and (len(active) == 1 or np.isfinite(_misfit([target], theta)[0])):
             yield target
 
 
@@ -161,6 +163,19 @@ def _space_by_logarithm(f: Float[np.ndarray, " m"], good: Any) -> Any:
     return candidates[np.unique(nearest)]
 
 
+def _misfits(targets: list[_Target], candidates: list[ParameterVector]) -> Float[np.ndarray, " k"]:
+    """Return half the squared misfit of each candidate, of all at once."""
+    costs = np.zeros(len(candidates))
+    for target in targets:
+        g = np.array([target.model.matrices(theta[target.index])[0] for theta in candidates])
+        try:
+            r, _, _, _ = _mismatch(target, g)
+        except np.linalg.LinAlgError:  # of one of them
+            return np.array([_misfit(targets, theta)[0] for theta in candidates])
+        costs += 0.5 * np.sum(np.real(r) ** 2 + np.imag(r) ** 2, axis=(1, 2))
+    return np.where(np.isfinite(costs), costs, np.inf)
+
+
 @np.errstate(all="ignore")  # callers look for what is not finite
 def _mismatch(
     target: _Target, g: Float[np.ndarray, "*k rows cols"]
@@ -181,64 +196,51 @@ def _mismatch(
     return target.weight * wrapped, response, x, back
 
 
-@np.errstate(all="ignore")
-def _misfit(
-    targets: list[_Target], candidates: Float[np.ndarray, "k p"], *, derivatives: bool = False
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k p"], Float[np.ndarray, "k p p"]]:
-    """Return half the squared misfit of all candidates at once, with gradients and Gauss-Newton Hessians if asked."""
-    k, p = candidates.shape
-    cost, gradient, hessian = np.zeros(k), np.zeros((k, p)), np.zeros((k, p, p))
+def _misfit(targets: list[_Target], theta: ParameterVector, derivatives: bool = False) -> tuple[float, Any, Any]:
+    """Return half the squared misfit, and its gradient and Gauss-Newton Hessian if asked."""
+    cost, gradient, hessian = 0.0, np.zeros(theta.size), np.zeros((theta.size, theta.size))
     for target in targets:
-        nx, index = target.model.nx, np.array(target.index, dtype=int)
-        rows, column = [nx + o for o in target.outputs], nx + target.input
-        g, dg = (np.array(each) for each in zip(*map(target.model.matrices, candidates[:, index]), strict=True))
+        nx, rows = target.model.nx, [target.model.nx + o for o in target.outputs]
+        g, dg = target.model.matrices(theta[target.index])
         try:
             r, response, x, back = _mismatch(target, g)
         except np.linalg.LinAlgError:
-            if k == 1:
-                return np.full(1, np.inf), np.zeros((1, p)), np.zeros((1, p, p))
-            alone = [_misfit(targets, candidate[None], derivatives=derivatives) for candidate in candidates]
-            cost, gradient, hessian = (np.concatenate(each) for each in zip(*alone, strict=True))
-            return cost, gradient, hessian
-        cost += 0.5 * np.sum(np.real(r) ** 2 + np.imag(r) ** 2, axis=(1, 2))
-        if not derivatives:
-            continue
-        along, across = x.swapaxes(1, 2)[:, None], (0, 3, 2, 1)
-        db, dc, dd = dg[:, :, :nx, column], dg[:, :, rows, :nx], dg[:, :, rows, column]
-        moved = back @ ((dg[:, :, :nx, :nx] @ along).transpose(across) + db.swapaxes(1, 2)[:, None])
-        slope = g[:, None, rows, :nx] @ moved + (dc @ along).transpose(across) + dd.swapaxes(1, 2)[:, None]
-        j = ((target.weight / response * target.shift)[..., None] * slope).reshape(k, -1, index.size)
-        turned = j.conj().swapaxes(1, 2)
-        gradient[:, index] += (turned @ r.reshape(k, -1, 1)).real[..., 0]
-        hessian[:, index[:, None], index] += (turned @ j).real
-    lost = ~np.isfinite(cost)
-    cost[lost], gradient[lost], hessian[lost] = np.inf, 0.0, 0.0
+            return np.inf, gradient, hessian
+        if not np.all(np.isfinite(r)):
+            return np.inf, gradient, hessian
+        cost += 0.5 * float(np.vdot(r, r).real)
+        if derivatives:
+            c, db, dc = g[rows, :nx], dg[:, :nx, nx + target.input], dg[:, rows, :nx]
+            moved = back @ ((dg[:, :nx, :nx] @ x.T).transpose(2, 1, 0) + db.T)
+            slope = c @ moved + (dc @ x.T).transpose(2, 1, 0) + dg[:, rows, nx + target.input].T
+            j = ((target.weight / response * target.shift)[:, :, None] * slope).reshape(r.size, -1)
+            gradient[target.index] += (j.conj().T @ r.ravel()).real
+            columns = np.array(target.index)
+            hessian[columns[:, None], columns] += (j.conj().T @ j).real
     return cost, gradient, hessian
 
 
-@np.errstate(invalid="ignore")  # no gain where both are infinite
 def _refine(
-    targets: list[_Target], candidates: Float[np.ndarray, "k p"], low: Any, high: Any, spread: Any
-) -> list[tuple[float, ParameterVector]]:
-    """Gauss-Newton in the logarithms of the parameters, damped, from each candidate: their misfits, and where."""
-    theta, damping, going = candidates.copy(), np.full(len(candidates), 1e-2), np.ones(len(candidates), dtype=bool)
+    targets: list[_Target], theta: ParameterVector, low: Any, high: Any, spread: Any
+) -> tuple[float, ParameterVector]:
+    """Gauss-Newton in the logarithms of the parameters, damped."""
+    damping = 1e-2
     cost, gradient, hessian = _misfit(targets, theta, derivatives=True)
-    diagonal = np.arange(theta.shape[1])
     for _ in range(25):
-        at = np.flatnonzero(going)
-        if not at.size:
-            break
-        scale = np.where(spread, theta[at], 0.0)
-        h = hessian[at] * scale[:, :, None] * scale[:, None, :]
-        sizes = h[:, diagonal, diagonal]
-        h[:, diagonal, diagonal] += damping[at, None] * sizes + 1e-9 * (1.0 + np.max(sizes, axis=1, keepdims=True))
-        step = np.clip(-np.linalg.solve(h, (gradient[at] * scale)[..., None])[..., 0], -1.5, 1.5)
-        trial = np.clip(np.where(spread, theta[at] * np.exp(step), theta[at]), low, high)
-        of_trial = _misfit(targets, trial, derivatives=True)
-        better, gain = of_trial[0] < cost[at], cost[at] - of_trial[0]
-        small = better & (gain < 1e-3 * cost[at])  # least squares in time goes on from here
-        damping[at] = np.where(better, np.maximum(damping[at] / 5, 1e-9), damping[at] * 8)
-        going[at] = ~(small | (~better & (damping[at] > 1e6)))
-        for values, new in zip((theta, cost, gradient, hessian), (trial, *of_trial), strict=True):
-            values[at[better]] = new[better]
-    return [(float(each), values) for each, values in zip(cost, theta, strict=True)]
+        scale = np.where(spread, theta, 0.0)
+        h = hessian * np.outer(scale, scale)
+        h[np.diag_indices(theta.size)] += damping * np.diag(h) + 1e-9 * (1.0 + np.max(np.diag(h)))
+        step = np.clip(-np.linalg.solve(h, gradient * scale), -1.5, 1.5)
+        trial = np.clip(np.where(spread, theta * np.exp(step), theta), low, high)
+        trial_cost, trial_gradient, trial_hessian = _misfit(targets, trial, derivatives=True)
+        if trial_cost < cost:
+            small = cost - trial_cost < 1e-3 * cost  # least squares in time goes on from here
+            theta, cost, gradient, hessian = trial, trial_cost, trial_gradient, trial_hessian
+            damping = max(damping / 5, 1e-9)
+            if small:
+                break
+        else:
+            damping *= 8
+            if damping > 1e6:
+                break
+    return cost, theta
