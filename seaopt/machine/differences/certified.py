@@ -4,8 +4,8 @@
 of the certificate is, but for the disc of the measurement and 2 % of the response, and of which one machine within the
 spread of the draws explains all lines together (`joint`). It is not where the best cause, at that end of its interval
 where it does least, takes a line further than that: one size out of all lines tells what none of them does by itself.
-The nearest draw is the one of the least misfit, sum over the
-lines of the square of what it is off by, over the measurement's std.
+The nearest draw is the one of the least misfit, sum over the lines of the square of what it is off by, over the
+measurement's std.
 
 A sensor is at its range where readings pile up at an edge of what was read while the command moves on.
 """
@@ -123,12 +123,10 @@ def _is_beyond(
     """Tell whether the best cause, with the least of it that its interval has, is more than certified machines have.
     `reach`: of their responses from the model's.
     """
-    low, high, explained = best.low, best.high, (best.left or 0.0) <= comparison.most_noise
-    if best.kind not in ("gain", "parameter") or best.beside or not explained or low is None or high is None:
+    explained = (best.left or 0.0) <= comparison.most_noise
+    if best.kind not in ("gain", "parameter") or best.beside or not explained or not best.is_there:
         return False
-    if low <= 1.0 <= high:
-        return False
-    least = low if low > 1.0 else high
+    least = min((each for each in (best.low, best.high) if each is not None), key=lambda each: abs(each - 1.0))
     if best.kind == "gain":
         changed = least * model
     else:

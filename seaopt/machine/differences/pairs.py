@@ -101,13 +101,7 @@ def _is_worth(pair: Tried, single: float, noise: float) -> bool:
     """Tell whether two causes explain much more than one, and both are there."""
     gained = single - pair.left > 2.0 * UNTOLD * max(pair.left / noise, 1.0)
     parts = (pair.difference, *pair.difference.beside)
-    return gained and pair.left <= HALVES * single and all(_is_there(part) for part in parts)
-
-
-def _is_there(part: Difference) -> bool:
-    """Tell whether the interval of a difference excludes that there is none."""
-    none = {"parameter": 1.0, "delay": 0.0}.get(part.kind, np.inf)
-    return part.low is not None and part.high is not None and not part.low <= none <= part.high
+    return gained and pair.left <= HALVES * single and all(part.is_there for part in parts)
 
 
 def _fold(pairs: Sequence[Tried]) -> list[Tried]:

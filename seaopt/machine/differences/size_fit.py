@@ -42,6 +42,12 @@ class Difference:
     beside: tuple[Difference, ...] = ()  # what differs besides, of two that explain it together
     untold: bool = False  # the log does not tell it from the one that is named first
 
+    @property
+    def is_there(self) -> bool:
+        """Whether its interval excludes that there is none."""
+        none = {"parameter": 1.0, "gain": 1.0, "delay": 0.0}.get(self.kind, math.inf)
+        return self.low is not None and self.high is not None and not self.low <= none <= self.high
+
 
 @record(eq=False)
 class Tried:
