@@ -25,15 +25,17 @@ from seaopt.machine.differences.few_periods import find_most_noise, find_widenin
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.judged import Measured
 from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
-from seaopt.machine.response.verdicts import find_noise_share, has_dry_friction, measure_noise
+from seaopt.machine.response.verdicts import has_dry_friction
 from seaopt.machine.ticks import Ticks
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.records import record
+from seaopt.signals import measure_white
 
 TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
 SHAKES = 0.3  # of the command's rms, from which on noise is simulated, too
+GRID = 400  # frequencies over which a law's response to noise is averaged
 Lines = Complex[np.ndarray, " m"]
 
 
@@ -130,14 +132,22 @@ class Comparison:
         """Return the outputs of runs under a share of a log's reference, with the noise of its readings where that
         shakes the motor.
         """
-        reference = share * ticks.reference
-        if not has_dry_friction(self.controller) or find_noise_share(self.controller, ticks) < SHAKES:
+        reference, shaking = share * ticks.reference, self._find_shaking(ticks)
+        if shaking is None:
             return run_design(source, sets, reference, rate=self.rate).outputs
-        noise = dict(zip(self.controller.signals, measure_noise(ticks), strict=True))
-        sensors = Sensors(noise_std={name: std for name, std in noise.items() if name in self.plant.outputs})
         gains = np.repeat([1.0, -1.0], len(sets))
-        both = run_design(source, [*sets, *sets], reference, sensors=sensors, noise_gain=gains, rate=self.rate)
+        both = run_design(source, [*sets, *sets], reference, sensors=shaking, noise_gain=gains, rate=self.rate)
         return {name: rows.reshape(2, len(sets), -1).mean(axis=0) for name, rows in both.outputs.items()}
+
+    def _find_shaking(self, ticks: Ticks) -> Sensors | None:
+        """Return the noise of a log's readings where it shakes the motor through dry friction."""
+        if not has_dry_friction(self.controller):
+            return None
+        noise = _measure_noise(ticks)
+        if _find_share(self.controller, ticks, noise) < SHAKES:
+            return None
+        stds = zip(self.controller.signals, noise.tolist(), strict=True)
+        return Sensors(noise_std={name: std for name, std in stds if name in self.plant.outputs})
 
     def _cut(self, outputs: Sequence[Mapping[str, Float[np.ndarray, "runs n"]]], k: int) -> list[Blocks]:
         """Return the periods of the k-th of some runs, but those in which the logged command is at its limit."""
@@ -172,3 +182,16 @@ def _shift_early(values: ParameterSet, period_s: float) -> tuple[int, ParameterS
     ticks = sum(math.ceil(-parameter.value / period_s) for parameter in late)
     left = (replace(parameter, value=parameter.value + ticks * period_s) for parameter in late)
     return ticks, values.with_parameters(*left)
+
+
+def _measure_noise(ticks: Ticks) -> Float[np.ndarray, " y"]:
+    """Return the std of the noise of each signal that is read, taken as white."""
+    return np.array([measure_white(reading[np.isfinite(reading)]) for reading in ticks.measured.T])
+
+
+def _find_share(controller: Controller, ticks: Ticks, noise: Float[np.ndarray, " y"]) -> float:
+    """Return the share of the command's rms that the noise of what is read makes."""
+    f = np.linspace(0.0, 0.5 / controller.sample_time_s, GRID + 2)[1:-1]
+    power = np.mean(np.abs(controller.law.responses(f)[1:]) ** 2, axis=1)
+    made = abs(controller.per_effort) * float(np.sqrt(noise**2 @ power))
+    return made / max(float(np.nanstd(ticks.command)), 1e-300)

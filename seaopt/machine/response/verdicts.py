@@ -46,10 +46,8 @@ from seaopt.machine.response.judged import Judged, Measured, Outcome, Prediction
 from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import Blocks
 from seaopt.machine.response.reach import Band, find_missing, find_reach
-from seaopt.machine.ticks import Ticks
 from seaopt.plants.friction import find_dry_friction, split_friction
 from seaopt.records import record
-from seaopt.signals import measure_white
 
 LEAST_PHASES = 6  # sets of phases, with dry friction
 SAME_GAIN = 0.1  # relative, between two amplitudes
@@ -60,7 +58,6 @@ SHORT_BY = 0.1  # of the bandwidth
 CENTRE = 1.0 - 1e-9  # a risk at which discs are points
 MOST_PERIODS = 1e6  # that are counted
 TRACKING = ("reference peak", "bandwidth")
-GRID = 400  # frequencies over which a law's response to noise is averaged
 HOUR = 3600.0  # s: a record that is longer is not asked for
 
 
@@ -140,19 +137,6 @@ def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
         "tracking_im": np.imag(part.tracking.value),
         "tracking_radius": part.tracking.disc(alpha)[1],
     }
-
-
-def measure_noise(ticks: Ticks) -> Float[np.ndarray, " y"]:
-    """Return the std of the noise of each signal that is read, taken as white."""
-    return np.array([measure_white(reading[np.isfinite(reading)]) for reading in ticks.measured.T])
-
-
-def find_noise_share(controller: Controller, ticks: Ticks) -> float:
-    """Return the share of the command's rms that the noise of what is read makes."""
-    f = np.linspace(0.0, 0.5 / controller.sample_time_s, GRID + 2)[1:-1]
-    power = np.mean(np.abs(controller.law.responses(f)[1:]) ** 2, axis=1)
-    noise = abs(controller.per_effort) * float(np.sqrt(measure_noise(ticks) ** 2 @ power))
-    return noise / max(float(np.nanstd(ticks.command)), 1e-300)
 
 
 def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured:
