@@ -7,7 +7,7 @@ the values (`second_log`). It has to be narrow enough to design with, and the lo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +15,10 @@ from jaxtyping import Float
 
 from seaopt.estimation.judgement.second_log import FAR, SECOND, find_excess, has_two_amplitudes
 from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
 from seaopt.estimation.problem.residual_statistics import compute_residuals
-from seaopt.estimation.problem.shapes import Signal
+from seaopt.estimation.problem.shapes import Signal, Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit, Minimum
@@ -146,23 +147,14 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
     residuals fall by more than chance makes of residuals of this colour. Where that moves values beyond their
     intervals, these are not to be believed.
     """
+    from scipy.special import chdtri  # deferred: 0.1 s
+
     minimum = fit.require_minimum("find_wrong_starts")
     problem = minimum.problem
-    stated = {
-        e.name: replace(e.data, initial_state="estimate")
-        for e in problem.experiments
-        if e.data.initial_state != "estimate"
-    }
+    stated = {e.name for e in problem.experiments if e.data.initial_state != "estimate"}
     if not stated or fit.status != "converged":
         return
-    freed, at = problem.rebuild(problem.params, minimum.z, stated)
-    freed, states = copy_steps(freed, problem), dict.fromkeys(stated, 0)
-    for old, new in zip(problem.experiments, freed.experiments, strict=True):
-        for before, after in zip(old.segments, new.segments, strict=True):
-            for known, slot in zip(before.initial, after.initial, strict=True):
-                if slot.index is not None:
-                    at[slot.index] = known.at(minimum.z)
-                    states[old.name] += 1
+    freed, at, states = _free_starts(minimum, stated)
     first = freed.evaluate(at)
     if not np.all(np.isfinite(first.hessian)):
         return
@@ -179,10 +171,8 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
             continue
         before, after = fitted[name].rms, best.power[name].rms
         falls = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
-        # Of simulated logs without noise the residual is rounding, and the integration's error.
-        from scipy.special import chdtri  # deferred: 0.1 s
-
         enough = 0.5 * float(chdtri(states[name], CHANCE)) * colour  # each state that is freed takes some away
+        # Of simulated logs without noise the residual is rounding, and the integration's error.
         if float(fitted[name].counts @ falls) < enough or np.max(before * sizes) < FAINT:
             continue
         gone = 1.0 - math.exp(-2.0 * float(np.max(falls)))
@@ -198,6 +188,23 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
             proposal='[[experiment]]\ninitial_state = "estimate"',
             python='so.Experiment(..., initial_state="estimate")',
         )
+
+
+def _free_starts(minimum: Minimum, stated: Collection[str]) -> tuple[FitProblem, Vector, dict[str, int]]:
+    """Return the problem with the states free in which some experiments begin, the minimum in it, and how many states
+    of each are free.
+    """
+    problem = minimum.problem
+    changed = {e.name: replace(e.data, initial_state="estimate") for e in problem.experiments if e.name in stated}
+    freed, at = problem.rebuild(problem.params, minimum.z, changed)
+    states = dict.fromkeys(stated, 0)
+    for old, new in zip(problem.experiments, freed.experiments, strict=True):
+        for before, after in zip(old.segments, new.segments, strict=True):
+            for known, slot in zip(before.initial, after.initial, strict=True):
+                if slot.index is not None:
+                    at[slot.index] = known.at(minimum.z)
+                    states[old.name] += 1
+    return copy_steps(freed, problem), at, states
 
 
 def _measure_waves(fit: Fit) -> dict[str, float]:
@@ -295,9 +302,8 @@ def _find_moves(values: Signal) -> tuple[int, int]:
     rest, largest = float(np.median(power)), float(np.ptp(values))
     power -= rest  # of a reading's noise
     moves = power > MOVES * np.max(power)
-    square = rest / -(
-        -values.size // BLOCKS
-    )  # of what changes from sample to sample: twice the variance of what is white
+    # Of what changes from sample to sample: twice the variance of what is white.
+    square = rest / math.ceil(values.size / BLOCKS)
     small = values.size > BLOCKS and 0.0 < 0.5 * square <= (READING * largest) ** 2
     blocks = np.array_split(values, BLOCKS) if small else []
     if small and float(np.median([np.var(block) for block in blocks])) <= square:  # white
@@ -311,9 +317,9 @@ def _find_moves(values: Signal) -> tuple[int, int]:
 
 def _sum_blocks(values: Signal) -> Float[np.ndarray, " blocks"]:
     """Return the sums over blocks that are cut as `np.array_split` cuts them."""
-    sizes = values.size // BLOCKS + (np.arange(BLOCKS) < values.size % BLOCKS)
     if values.size < BLOCKS:  # some of them are empty, of which reduceat makes what follows them
         return np.array([float(np.sum(block)) for block in np.array_split(values, BLOCKS)])
+    sizes = values.size // BLOCKS + (np.arange(BLOCKS) < values.size % BLOCKS)
     return np.add.reduceat(values, np.cumsum(sizes) - sizes)
 
 
