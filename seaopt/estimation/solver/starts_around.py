@@ -36,8 +36,12 @@ def search_around(solved: Solved, seed: int, max_iterations: int, callback: Call
     """
     problem, z = solved.problem, solved.solution.z
     unknowns, count = problem.unknowns, problem.unknowns.shared
-    lost = any(e.model.sticks for e in problem.experiments) and _measure_most(solved) > LOST
-    if problem.all_linear or not (lost or _has_strayed(solved)) or _leaves_noise(solved):
+    sticks, strayed = any(e.model.sticks for e in problem.experiments), _has_strayed(solved)
+    if problem.all_linear or not (sticks or strayed):
+        return solved
+    most = _measure_most(solved)
+    lost = sticks and most > LOST
+    if most <= NOISE or not (lost or strayed):
         return solved
     callback, rng, best = name_phase(callback, "another start"), np.random.default_rng(seed), solved
     held = _hold_delays(problem) if lost else problem
@@ -53,7 +57,7 @@ def search_around(solved: Solved, seed: int, max_iterations: int, callback: Call
         if lost:
             rough = settle_roughly(problem, problem.evaluate(rough.solution.z), callback)
         best = min(best, rough, key=lambda each: each.misfit)
-        if best is rough and _leaves_noise(rough):
+        if best is rough and _measure_most(rough) <= NOISE:
             break
     if best is solved:
         return solved
@@ -80,10 +84,6 @@ def _has_strayed(solved: Solved) -> bool:
     variances = np.diag(invert(evaluation.hessian)[0])[: unknowns.shared]
     far = (z > FAR * start) | ((z < start / FAR) & (variances < z**2))
     return bool(np.any(far & (start > 0.0)))
-
-
-def _leaves_noise(solved: Solved) -> bool:
-    return _measure_most(solved) <= NOISE
 
 
 def _measure_most(solved: Solved) -> float:
