@@ -231,12 +231,10 @@ def _place_terms(terms: Compensation | None) -> dict[str, int]:
     """Return which reading each term reads, from 1 on, and 0 for none; friction's from 2 on, 1 for the reference."""
     if terms is None:
         return {"TERMS": 0}
-    friction, (gravity, ripple) = (
-        terms.friction,
-        (0 if term is None else 1 + terms.reads.index(term.reads) for term in (terms.gravity, terms.ripple)),
-    )
-    rubs = 0 if friction is None else 2 + terms.reads.index(friction.reads) if friction.reads else 1
-    return {"TERMS": 1, "READINGS": len(terms.reads), "GRAVITY": gravity, "RIPPLE": ripple, "FRICTION": rubs}
+    placed = {None: 0, "": 0} | {name: 1 + i for i, name in enumerate(terms.reads)}
+    gravity, ripple = (placed[term and term.reads] for term in (terms.gravity, terms.ripple))
+    friction = 0 if terms.friction is None else 1 + placed[terms.friction.reads]
+    return {"TERMS": 1, "READINGS": len(terms.reads), "GRAVITY": gravity, "RIPPLE": ripple, "FRICTION": friction}
 
 
 def _format_part(said: str, numbers: Mapping[str, float | Sequence[float]], *texts: str) -> str:
