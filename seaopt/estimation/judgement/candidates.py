@@ -39,7 +39,8 @@ from seaopt.units import ROTARY, mechanics_of, unit_after
 MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
 SHARPER = 0.1  # times the speed that friction is smoothed over, below which it is a jump
 SAME_EFFECT = 1e-3  # of a test's figures, by which parameters that act alike may differ
-POLES = ("load_cell_hz", "sensor_filter_hz")  # of the parts that read an output through a low-pass
+POLE = "load_cell_hz"  # of the part that reads an output through a pole
+FILTERED = (POLE, "sensor_filter_hz")  # of all parts that read one through a low-pass
 LEAD = 40  # samples that signals are shifted by so that a delay may be negative
 UNIT_FACTORS = {1e3: "1000", 1e-3: "0.001", 4.448: "4.448", 1.0 / 4.448: "1/4.448"}
 LIKELY_GAINS = (0.05, 20.0)  # of sensors that are not of another unit
@@ -414,7 +415,7 @@ def find_clipping(model: Signal, measured: Signal) -> tuple[float, float, float,
 def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -> Iterator[Candidate]:
     """Yield the outputs as read through a pole, all of them or one."""
     first = experiments[0]
-    filtered = any(name in first.plant.parameters for name in POLES)
+    filtered = not first.plant.parameters.keys().isdisjoint(FILTERED)
     if filtered or any(e.plant is not first.plant for e in experiments):
         return
     regulated = () if first.plant.sensing is None else first.plant.sensing.regulated
@@ -424,7 +425,7 @@ def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -
         plant, names = wrapped(first.plant, ("load_cell",), outputs=group), join_words(group)
 
         def describe(values: Values, stds: Values, names: str = names) -> str | None:
-            cut = values[POLES[0]]
+            cut = values[POLE]
             if cut > fastest:
                 return None
             return (
@@ -433,7 +434,7 @@ def _filter_outputs(experiments: tuple[Experiment, ...], params: ParameterSet) -
             )
 
         # The faster a pole, the more integration steps it takes: its range ends soon after what is said of it.
-        default = plant.complete(params)[POLES[0]]
+        default = plant.complete(params)[POLE]
         pole = replace(default, value=0.3 * fastest / FASTEST_POLE, free=True, max=2.0 * fastest)
         yield Candidate(
             where=names,
