@@ -2,9 +2,8 @@
    a pass is.
 
    Built with constants, sums.h, pass.h and lanes.h in front. Bands, corrections, influences and what is resumed are for
-   pass.c. A step waits for one chain of operations, in which a processor could do
-   several times as many: a vector holds a number of each of four stretches. Stretches are of one point; each makes its own
-   number of steps in a row, and steps of no length until the last one is through.
+   pass.c. A vector holds a number of each of four stretches. Stretches are of one point; each makes its own number of steps
+   in a row, and steps of no length until the last one is through.
 
    In front stand, made of CasADi's functions,
      seaopt_rate(t, x, u, du, c, f, fx, fp), seaopt_output(&t, x, u, du, c, h, hx, hp)    and their nonzero derivatives

@@ -558,6 +558,8 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
     deliver(q, a);
 }
 
+/* Apart from run_jobs, for inlined there its sums come in another order: the last digit decides which way a search that
+   is near the end of its budget goes. */
 ONCE void pass_states(const seaopt_pass_args *a) { one_pass(a, 1); }
 
 typedef struct { const seaopt_pass_args *list; long count; } jobs;

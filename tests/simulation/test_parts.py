@@ -171,6 +171,21 @@ def test_passes_that_are_kept_are_those_that_are_not(damping: float, friction: f
     assert second.loss != pytest.approx(first.loss, rel=1e-6)
 
 
+@pytest.mark.parametrize(("damping", "friction", "joined"), [(12_000.0, 100.0, True), (1.0, 0.0, False)])
+def test_long_passes_run_in_parts_where_the_plant_forgets(monkeypatch, damping, friction, joined):
+    program, point = make_program(damping, friction)
+    alone, run = list[int](), Program.run
+
+    def count(self: Program, *given: Any, **options: Any) -> Pass:
+        alone.append(1)
+        return run(self, *given, **options)
+
+    monkeypatch.setattr(Program, "run", count)
+    with keep_passes():
+        run_passes(program.model, program.segment, point, X0, columns=True)
+    assert not alone if joined else alone == [1]
+
+
 def test_a_part_without_a_measured_sample_begins_where_the_one_before_ends():
     """What is not measured tells nothing of a wrong state there: outputs were off by twice their size."""
     program, point = make_program(1.0, 0.0)  # forgets nothing
