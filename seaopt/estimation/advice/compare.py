@@ -31,7 +31,14 @@ import numpy as np
 
 from seaopt.codec import Key, to_content
 from seaopt.errors import EstimationError
-from seaopt.estimation.advice.forecasts import Percent, compute_percent, filter_to_band, simulate_freely, split_samples
+from seaopt.estimation.advice.forecasts import (
+    Percent,
+    compute_percent,
+    filter_to_band,
+    measure_length,
+    simulate_freely,
+    split_samples,
+)
 from seaopt.estimation.problem.correlation import autocorrelation
 from seaopt.estimation.problem.fit_experiment import FitOutput
 from seaopt.estimation.problem.fit_problem import FitProblem
@@ -293,8 +300,8 @@ def _compare_held_out(problem: FitProblem, other: ResidualsByExperiment, best: R
         if np.any(held_out):
             raw = [residuals[output.experiment.name].raw_of(output.name) for residuals in (other, best)]
             signals = [filter_to_band(output.experiment, rows)[held_out] for rows in raw]
-            rms = [max(float(np.sqrt(np.mean(signal**2))), 1e-300) for signal in signals]
-            logs.append(float(np.log(rms[0] / rms[1])))
+            lengths = [max(measure_length(signal), 1e-150) for signal in signals]
+            logs.append(float(np.log(lengths[0] / lengths[1])))
     return float(np.exp(np.mean(logs))) if logs else None
 
 

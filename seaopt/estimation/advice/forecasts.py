@@ -57,11 +57,17 @@ def compute_percent(output: FitOutput, residuals: ResidualsByExperiment) -> Perc
     raw = filter_to_band(output.experiment, residuals[output.experiment.name].raw_of(output.name))
 
     def percent(rows: Bool[np.ndarray, " n"]) -> float:
-        spread = float(np.sum((measured[rows] - np.mean(measured[rows])) ** 2))
-        return 100.0 * (1.0 - float(np.sqrt(np.sum(raw[rows] ** 2) / max(spread, 1e-300))))
+        spread = measure_length(measured[rows] - np.mean(measured[rows]))
+        return 100.0 * (1.0 - measure_length(raw[rows]) / max(spread, 1e-150))
 
     used, held_out = split_samples(output)
     return Percent(used=percent(used), held_out=percent(held_out) if np.any(held_out) else None)
+
+
+def measure_length(signal: Signal) -> float:
+    """Return the root of the sum of squares, also of a free run that runs away so far that its squares overflow."""
+    largest = float(np.max(np.abs(signal), initial=0.0))
+    return largest * float(np.linalg.norm(signal / largest)) if 0.0 < largest < np.inf else largest
 
 
 def filter_to_band(experiment: FitExperiment, rows: Parts) -> Signal:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,9 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING
 from seaopt.errors import EstimationError
 from seaopt.estimation import compare
+from seaopt.estimation.advice.compare import _compare_held_out
+from seaopt.estimation.advice.forecasts import compute_percent
+from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.files import to_json
 
 pytestmark = pytest.mark.usefixtures("without_causes")  # which no comparison reads
@@ -59,6 +63,21 @@ def test_swing_logs_of_the_lumped_plant_never_prefer_the_other(thor, outputs):
     search = so.OutputError(search=False, max_iterations=20)
     ranking = compare(fits_of(so.plants.moving_output, log, thor, outputs, method=search))
     assert ranking.preferred in ("lumped", None)
+
+
+def test_a_free_run_that_runs_away_has_a_fit_percent(thor):
+    """Squares of 1e200 overflow; their root does not."""
+    log = log_of(so.plants.high_impedance, "unlumped", PAPER_STAND, thor, duration_s=2)
+    fit = fits_of(so.plants.high_impedance, log, thor, ("F1",), holdout=0.25)["unlumped"]
+    minimum = fit.require_minimum("compare")
+    (output,) = minimum.problem.outputs
+    near = minimum.residuals()
+    part = near["bench"].segments[0]
+    away = ExperimentResiduals(outputs=("F1",), segments=(replace(part, raw=1e200 * part.raw),))
+    percent, far = (compute_percent(output, residuals) for residuals in (near, {"bench": away}))
+    assert far.used - 100.0 == pytest.approx(1e200 * (percent.used - 100.0), rel=1e-9)
+    assert far.held_out - 100.0 == pytest.approx(1e200 * (percent.held_out - 100.0), rel=1e-9)
+    assert _compare_held_out(minimum.problem, {"bench": away}, near) == pytest.approx(1e200, rel=1e-9)
 
 
 def test_f1_on_the_stand_cannot_tell_them_apart(thor):
