@@ -147,13 +147,13 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
     residuals fall by more than chance makes of residuals of this colour. Where that moves values beyond their
     intervals, these are not to be believed.
     """
-    from scipy.special import chdtri  # deferred: 0.1 s
-
     minimum = fit.require_minimum("find_wrong_starts")
     problem = minimum.problem
     stated = {e.name for e in problem.experiments if e.data.initial_state != "estimate"}
     if not stated or fit.status != "converged":
         return
+    from scipy.special import chdtri  # deferred: 0.1 s
+
     freed, at, states = _free_starts(minimum, stated)
     first = freed.evaluate(at)
     if not np.all(np.isfinite(first.hessian)):
