@@ -36,12 +36,14 @@ from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import limit_evaluations
 from seaopt.estimation.problem.noise_floor import NoiseFloor, measure_floors
+from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_ended_search, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.widening import widen
 from seaopt.estimation.solver.budget import EVALUATIONS, EvaluationBudget
+from seaopt.estimation.solver.least_squares import find_blocked
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
@@ -392,12 +394,23 @@ def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:
             remedy = "the logs want it beyond: widen the bound, or look for what the model lacks"
         else:
             remedy = "widen the bound, or fix it there and say why"
-        yield FitFinding(
-            severity="error" if bad else "note",
-            kind="bound",
-            where=name,
-            text=f"{z[i]:.4g} lies on its bound{',' if away else ';'} {remedy}",
-        )
+        text = f"{z[i]:.4g} lies on its bound{',' if away else ';'} {remedy}"
+        if i in periods and unknowns.low[i] == 0.0 and inward > 0.0:
+            free = ~find_blocked(evaluation, unknowns.low, unknowns.high) | (np.arange(z.size) == i)
+            variance = np.diag(invert(evaluation.hessian[free][:, free])[0])[np.count_nonzero(free[:i])]
+            text = _explain_no_delay(float(evaluation.gradient[i] * variance), bad=bad)
+        yield FitFinding(severity="error" if bad else "note", kind="bound", where=name, text=text)
+
+
+def _explain_no_delay(early_s: float, *, bad: bool) -> str:
+    """Return what a delay of none says; `early_s`: by how much a step to the minimum without a bound is negative."""
+    if not bad:
+        return "no delay can be told from none, and there is no shorter one: leave delay_s out, or give it as 0"
+    return (
+        f"a delay cannot be negative, and the outputs are some {1e3 * early_s:.2g} ms ahead of what acts on them: the "
+        "command is stamped late, or the outputs early; shift the channel (clock_offset_s), or look for what the model "
+        "lacks"
+    )
 
 
 def _find_implausible(fit: Fit) -> Iterator[FitFinding]:

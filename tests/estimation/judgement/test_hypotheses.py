@@ -298,6 +298,12 @@ def test_a_delay_of_none_may_come_out_a_little_negative(early_s, severity):
     result = so.fit([experiment], plant.defaults.update(**TRUTH).free("J_m", "k_s", "f_c", "b_r"))
     (bound,) = (finding for finding in result.findings if finding.kind == "bound")
     assert (bound.where, bound.severity) == ("log.delay_s", severity)
+    assert "widen" not in bound.text  # to a negative delay
+    if severity == "error":
+        assert float(bound.text.split(" ms ahead")[0].split()[-1]) == pytest.approx(1e3 * early_s, rel=0.3)
+        assert "clock_offset_s" in bound.text
+    else:
+        assert "leave delay_s out" in bound.text
 
 
 def test_what_was_held_out_is_no_noise_of_the_sensor():
