@@ -149,6 +149,31 @@ def test_a_clock_called_time_without_unit_has_that_of_the_size_of_its_steps_and_
     assert json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))["rate_hz"] == pytest.approx(400.0)
 
 
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [
+        *[(name, "ms") for name in ("Zeit/ms", "Zeit [ms]", "t_ms", "t/ms", "Zeit ms", "log/Zeit/ms")],
+        *[(name, "us") for name in ("timestamp_us", "t/\u00b5s", "time_usec")],
+        *[(name, "s") for name in ("Time (s)", "Time/s", "time_sec")],
+    ],
+)  # fmt: skip
+def test_a_name_and_a_unit_are_the_clock_however_they_are_joined(tmp_path, header, unit):
+    """Even where a counter is named like a time, too; a unit that is given goes before that of the name."""
+    path, step = tmp_path / "log.csv", {"s": 0.0025, "ms": 2.5, "us": 2500.0}[unit]
+    rows = "".join(f"{7 * at};{step * at:.6g};{at % 3}\n".replace(".", ",") for at in range(40))
+    path.write_text(f"clock;{header};Strom/A\n" + rows, encoding="utf-8")
+    inspect_log(path, folder=tmp_path)
+    report = json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))
+    assert report["rate_hz"] == pytest.approx(400.0)
+    assert not any("assumed" in note for note in report["notes"])
+    log = so.read_log(path, channels={"I": "Strom/A"})
+    assert log.rate_hz == pytest.approx(400.0)
+    if "[" not in header and "(" not in header:
+        inspect_log(path, time=header, units=["time=s"], folder=tmp_path)
+        report = json.loads((tmp_path / "quality.json").read_text(encoding="utf-8"))
+        assert report["rate_hz"] == pytest.approx(1.0 / step)
+
+
 def test_a_column_that_runs_on_is_the_clock_to_type(tmp_path):
     """Milliseconds in a column whose name says nothing, behind one that does not run on."""
     path = tmp_path / "bare.csv"

@@ -17,14 +17,13 @@ from seaopt.logs.log.alignment import Rule
 from seaopt.logs.reading.clock_samples import guess_time_unit
 from seaopt.logs.reading.column import Column, spell_column
 from seaopt.logs.reading.counter import Counter
-from seaopt.logs.reading.vocabulary import QUANTITY_WORDS, find_unit_in_name
+from seaopt.logs.reading.vocabulary import QUANTITY_WORDS, find_unit_in_name, split_unit
 from seaopt.records import record
 from seaopt.signals import check_distinct
 from seaopt.units import bare_name, factor, is_unit, same_dimension, si_unit
 
 # Names of a time where nothing else has one, and of ticks beside it.
 COUNTERS = ("clock", "stamp", "uptime", "elapsed", "millis", "micros")
-_TIME_ENDING = re.compile(r"[_ ](s|ms|us|ns)$")
 MAX_NAMES = 20  # in a message
 HOW_TO_ALIGN = "align it by Hold(), Linear(), Nearest(tolerance_s=...) or Readings()"
 ALIGNED = ({"align": {"hold": {}}}, {"align": {"linear": {}}})  # the same as keys
@@ -338,19 +337,9 @@ def _find_time_column(source: Source) -> Column:
     """Return the one column that is named like a time."""
     names = [field.name for field in source.fields if field.numeric]
     lengths = {field.name: field.length for field in source.fields}
-    named = [field for field in source.fields if field.numeric and is_time_name(field.header or field.name)]
-    plain = [field for field in named if bare_name(field.header or field.name).casefold() not in COUNTERS]
-    named = plain or named
-    if not plain:
-        endings = {
-            field.name: _TIME_ENDING.search(field.name) for field in source.fields if field.numeric and not field.unit
-        }
-        stated = {
-            name: ending[1] for name, ending in endings.items() if ending and is_time_name(name[: ending.start()])
-        }
-        if len(stated) == 1:
-            ((name, unit),) = stated.items()
-            return Column(column=name, unit=unit)
+    ranks = [(field, _rank_time_name(field.header or field.name)) for field in source.fields if field.numeric]
+    first = min((rank for _, rank in ranks if rank is not None), default=0)
+    named = [field for field, rank in ranks if rank == first]
     # T in degrees is a temperature; of several, one with another unit is no time.
     times = [
         field.name
@@ -375,8 +364,21 @@ def advise_time(source: Source) -> str:
 
 
 def is_time_name(name: str) -> bool:
-    """Tell whether a column is named like a time."""
-    return re.split(r"[./]", bare_name(name))[-1].casefold() in QUANTITY_WORDS["time"]
+    """Tell whether a column is named like a time, with a unit behind it or without."""
+    return _rank_time_name(name) is not None
+
+
+def _rank_time_name(name: str) -> int | None:
+    """Return how clearly a column is named like a time: 0 as in "Zeit [ms]", 1 where the name ends in the unit, as
+    "Zeit/ms" or "t_ms", 2 of ticks beside a time; None of what is no time.
+    """
+    bare = bare_name(name)
+    unit, stem = split_unit(bare)
+    for rank, each in enumerate((bare, stem if unit and same_dimension(unit, "s") else "")):
+        last = re.split(r"[./]", each)[-1].casefold()
+        if last in QUANTITY_WORDS["time"]:
+            return 2 if last in COUNTERS and rank == 0 else rank
+    return None
 
 
 def _find_channel_clock(clock: ClockColumn, file_column: FileColumn) -> ClockColumn:

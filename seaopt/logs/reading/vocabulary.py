@@ -63,7 +63,8 @@ LONG = 4
 SUFFIXES = {
     "ma": "mA", "a": "A", "amp": "A", "mv": "mV", "v": "V", "n": "N", "kn": "kN", "nm": "N m", "mnm": "mN m",
     "nmm": "N mm", "rad": "rad", "mrad": "mrad", "deg": "deg", "grad": "deg", "mm": "mm", "um": "um", "m": "m",
-    "s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "pct": "percent", "percent": "percent",
+    "s": "s", "sec": "s", "sek": "s", "ms": "ms", "msec": "ms", "us": "us", "usec": "us", "\u00b5s": "us",
+    "\u03bcs": "us", "ns": "ns", "pct": "percent", "percent": "percent",
     "counts": "counts", "ticks": "counts", "cnt": "counts", "inc": "counts", "rpm": "rpm", "dps": "deg/s",
     "rad_s": "rad/s", "deg_s": "deg/s", "m_s": "m/s", "mm_s": "mm/s",
 }  # fmt: skip
@@ -99,7 +100,7 @@ def read_header(name: str, unit: str | None = None, *, metres: bool = True, brac
     name is the motor; without `brackets` what stands in them is part of the name.
     """
     stated, bare = _clean_unit(unit), bare_name(name) if brackets else name
-    suffix, stem = ("", bare) if stated else _split_suffix(bare)
+    suffix, stem = ("", bare) if stated else split_unit(bare)
     if suffix == "m" and not metres:
         suffix, stem = "", bare
     words = split_words(stem)
@@ -151,6 +152,16 @@ def is_named_time(name: str) -> bool:
     return bool(words) and words[0] in QUANTITY_WORDS["time"]
 
 
+def split_unit(name: str) -> tuple[str, str]:
+    """Return the unit that a name ends in, as "_mA", "/ms" or "_rad_s", and the rest of the name; "" where in none."""
+    parts = re.split(r"([\s_.\-/]+)", name.strip())
+    for words in (2, 1):
+        suffix = "_".join(parts[1 - 2 * words :: 2]).lower()
+        if len(parts) > 2 * words and suffix in SUFFIXES:
+            return SUFFIXES[suffix], "".join(parts[: -2 * words])
+    return "", name
+
+
 def split_words(name: str) -> list[str]:
     """Return the words of a name in small letters."""
     parts = re.findall(r"[A-Z]?[a-zäöüß]+\d*|[A-Z]+\d*(?![a-z])|[A-Z]\d*|\d+", name)
@@ -176,16 +187,6 @@ def _quantity_of_unit(unit: str) -> Quantity:
         return _QUANTITY_OF.get(si_unit(unit), "other" if si_unit(unit) else "")
     except SeaoptError:
         return ""
-
-
-def _split_suffix(name: str) -> tuple[str, str]:
-    """Return the unit that a name may end in, as "_mA" or "_rad_s", and the rest of the name; "" where it does not."""
-    *first, last = re.split(r"[\s_.\-/]+", name.strip())
-    if len(first) > 1 and f"{first[-1]}_{last}".lower() in SUFFIXES:
-        return SUFFIXES[f"{first[-1]}_{last}".lower()], "_".join(first[:-1])
-    if first and last.lower() in SUFFIXES:
-        return SUFFIXES[last.lower()], "_".join(first)
-    return "", name
 
 
 def _fits(unit: str, kinds: list[Quantity], words: list[str], *, position: bool) -> bool:
