@@ -11,16 +11,18 @@ SAID = {"text", "where", "reason", "message", "sentence", "explanation", "verdic
         "label", "draws", "proof", "assumption", "statement", "what", "str"}  # fmt: skip
 CUTS = {"split", "rsplit", "partition", "rpartition", "startswith", "endswith", "find", "index", "removeprefix",
         "removesuffix"}  # fmt: skip
+PATTERNS = {"search", "match", "fullmatch", "findall", "finditer", "split"}  # verbs of a regular expression that read
 # What is read there, and why it is no sentence of a result, or what it waits for.
 READERS = {
     "cli/frontier.py": "an argument of the command line",
     "cli/inspect.py": "an argument of the command line",
-    "cli/terminal.py": "blanks of an error's text",
+    "cli/terminal.py": "blanks of an error's text, and whether it names something to type",
     "control/laws/verdict.py": "active_constraints of controller.json are labels, NAME (PLANT)",
     "control/tuning/tuner.py": "labels of limits that are broken, as active_constraints",
     "errors.py": "blanks of an error's text",
     "files.py": "Python's own text of an error, without its advice to programmers",
     "estimation/result/identifiability.py": "EXPERIMENT.NAME of an unknown",
+    "fleet/history.py": "names of logs, in which numbers are sorted",
     "logs": "columns and files",
     "plants": "equations and files",
     "problem/problem.py": "a remark of an experiment, found by its name",
@@ -54,13 +56,16 @@ def list_parsed(source):
         match node:
             case ast.Call(func=ast.Attribute(attr=verb, value=value)) if verb in CUTS and name_of(value) in SAID:
                 yield ast.unparse(node)
+            case ast.Call(func=ast.Attribute(attr=verb), args=[*_, said]) if verb in PATTERNS and name_of(said) in SAID:
+                yield ast.unparse(node)
             case ast.Compare(ops=[ast.In() | ast.NotIn()], comparators=[value]) if name_of(value) in SAID:
                 yield ast.unparse(node)
 
 
 def test_the_search_finds_what_was_parsed_before():
     source = "plant = row.where.split(':')[0]\nhead = str(draws).partition(':')\nunstable = 'UNSTABLE' in row.text\n"
-    assert len(list(list_parsed(source))) == 3
+    source += "first = re.split(', ', question.text)[0]\nsize = _NUMBER.search(finding.text)\n"
+    assert len(list(list_parsed(source))) == 5
 
 
 def test_no_sentence_of_a_result_is_parsed():

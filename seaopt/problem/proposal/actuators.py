@@ -8,7 +8,6 @@ is asked, and is a prior or fixed.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -42,7 +41,8 @@ class ParameterLine:
     """A line of [parameters]."""
 
     name: str
-    value: str
+    number: float
+    value: str  # as it is written: the number, or a table with it
     comment: str
 
 
@@ -85,46 +85,50 @@ class _ParameterLines:
 
     def value(self, name: str) -> float:
         """Return the number of a line that is there."""
-        return next(float(re.findall(r"\d[\d.e+-]*", line.value)[0]) for line in self.lines if line.name == name)
+        return next(line.number for line in self.lines if line.name == name)
 
-    def add(self, name: str, value: str, mark: str = "") -> None:
+    def add(self, name: str, number: float, more: str = "", mark: str = "") -> None:
+        """Add a line: a number alone, or a table with `more` than that."""
         parameter = self.defaults[name]
         about = ", ".join(text for text in (parameter.description, unit_after(parameter.unit).strip("- ")) if text)
         comment = "; ".join(
             filter(None, (about, self.interview.mark(mark or name), self.interview.list_doubts().get(name)))
         )
-        self.lines.append(ParameterLine(name=name, value=value, comment=comment))
+        value = f"{{ value = {number:.10g}, {more} }}" if more else f"{number:.10g}"
+        self.lines.append(ParameterLine(name=name, number=number, value=value, comment=comment))
 
     def free(self, name: str, start: float | None = None, **bounds: float) -> None:
         value = self.defaults[name].value if start is None else start
-        more = "".join(f", {key} = {number:.10g}" for key, number in bounds.items())
-        self.add(name, f"{{ value = {value:.10g}, free = true{more} }}")
+        self.add(name, value, ", ".join(["free = true", *(f"{key} = {end:.10g}" for key, end in bounds.items())]))
 
-    def require(self, name: str, text: str, guess: float | None = None, why: str = "a typical value") -> float:
+    def require(
+        self, name: str, label: str, guess: float | None = None, why: str = "a typical value", *, meaning: str = ""
+    ) -> float:
         """Ask for a value that no log can tell, and write it."""
         start = self.defaults[name].value if guess is None else guess
-        value = self.interview.number(name, self._add_unit(text, name), start, why, USUAL.get(name))
-        self.add(name, f"{value:.10g}")
+        detail = meaning + self._in_unit(name)
+        value = self.interview.number(name, label, start, why, detail=detail, usual=USUAL.get(name))
+        self.add(name, value)
         return value
 
-    def perhaps(self, name: str, text: str, *, identified: bool, why: str) -> None:
+    def perhaps(self, name: str, label: str, *, identified: bool, why: str) -> None:
         """Ask for a value that the logs may tell: known, it is a prior; unknown, free if they tell, else a guess."""
-        value = self.optional(name, text, "it is fitted" if identified else why)
+        value = self.optional(name, label, "it is fitted" if identified else why)
         if value is not None:
-            self.add(name, f"{{ value = {value:.10g}, prior_std = {PRIOR * value:.3g} }}")
+            self.add(name, value, f"prior_std = {PRIOR * value:.3g}")
         elif identified:
             self.free(name)
         else:
             self.interview.assume(name)
-            self.add(name, f"{self.defaults[name].value:.10g}")
+            self.add(name, self.defaults[name].value)
 
-    def optional(self, name: str, text: str, why: str) -> float | None:
+    def optional(self, name: str, label: str, why: str) -> float | None:
         """Ask for a value that may be unknown."""
-        return self.interview.optional(name, f"{self._add_unit(text, name)}, or unknown", why, USUAL.get(name))
+        return self.interview.optional(name, label, why, detail=self._in_unit(name), usual=USUAL.get(name))
 
-    def _add_unit(self, text: str, name: str) -> str:
+    def _in_unit(self, name: str) -> str:
         unit = unit_after(self.defaults[name].unit).strip()
-        return f"{text}, in {unit}" if unit not in ("", "-") else text
+        return f", in {unit}" if unit not in ("", "-") else ""
 
 
 def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
@@ -135,7 +139,7 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
     why = "typical of a module; take it from the data sheet"
     if facts.gear_ratio is not None:
         why = "the motor turns this many times as far as the link"
-    lines.require("N", "Gear ratio N (turns of the motor for one of the output)", facts.gear_ratio, why)
+    lines.require("N", "Gear ratio N", facts.gear_ratio, why, meaning=" (turns of the motor for one of the output)")
     _add_drive(lines, facts, effort=effort)
     lines.free("J_m")
     lines.free("b_r")
@@ -146,7 +150,7 @@ def propose_rotary(interview: Interview, facts: Facts) -> Proposed:
     interview.assume(
         "c_s", "an undamped spring; with the link held its damping adds to b_r; a fit says where it explains more"
     )
-    lines.add("c_s", "0")
+    lines.add("c_s", 0.0)
     if moves:
         lines.free("J_l")
         lines.free("d_l", 0.1)
@@ -179,12 +183,13 @@ def _add_drive(lines: _ParameterLines, facts: Facts, *, effort: bool) -> None:
     if facts.input == "torque":
         side = lines.interview.ask(
             "torque_at",
-            "Is the commanded torque that of the motor or of the output, behind the gear?",
+            "Is the commanded torque that of the motor or of the output",
             "output",
             "as most robot drives take it",
             ("output", "motor"),
+            detail=", behind the gear?",
         )
-        lines.add("K_tau", f"{1.0 / lines.value('N') if side == 'output' else 1.0:.10g}", "torque_at")
+        lines.add("K_tau", 1.0 / lines.value("N") if side == "output" else 1.0, mark="torque_at")
         if effort:
             lines.free("eta", max=2.0)
     elif not effort:
@@ -194,7 +199,7 @@ def _add_drive(lines: _ParameterLines, facts: Facts, *, effort: bool) -> None:
         if value is None:
             lines.free("K_tau")
         else:
-            lines.add("K_tau", f"{value:.10g}")
+            lines.add("K_tau", value)
             lines.free("eta", 0.9, max=1.5)
     if facts.input in ("V", "duty"):
         lines.require("R", "Winding resistance R", why="a typical value; take it from the data sheet")
@@ -217,7 +222,7 @@ def _add_payload(lines: _ParameterLines, places: list[str]) -> dict[str, tuple[f
     )
     if mass is None:
         return {}
-    lines.add("m", f"{mass:.10g}")
+    lines.add("m", mass)
     reach = lines.require("L", "Distance L from its centre of mass to the joint", why="a typical value; measure it")
     places.append("hanging")
     if "free" in places:
@@ -234,7 +239,8 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
     forces, moves = facts.outputs & {"F1", "F2"}, "swing" in facts.places
     also = ", and correct the scale of q with it" if "screw" in facts.outputs else ""
     why = f"a typical value; take it from the data sheet{also}"
-    lines.require("l", "Travel l for one turn (lead of the screw, or circumference of the belt's pulley)", why=why)
+    meaning = " (lead of the screw, or circumference of the belt's pulley)"
+    lines.require("l", "Travel l for one turn", why=why, meaning=meaning)
     lines.require("N_p", "Reduction N_p between motor and screw", 1.0, f"driven directly{also}")
     _add_drive(lines, facts, effort=bool(forces))
     lines.free("J", 1e-5)
@@ -262,7 +268,7 @@ def propose_linear(interview: Interview, facts: Facts) -> Proposed:
         )
         if inertia is not None:
             _add_pendulum(lines, "link")
-            lines.add("I_p", f"{inertia:.10g}")
+            lines.add("I_p", inertia)
             places.append("swing")
             ranges["I_p"] = (WIDE[0] * inertia, WIDE[1] * inertia)
     options = {"drive": "unlumped", **({"parts": list(lines.parts)} if lines.parts else {})}
@@ -278,5 +284,5 @@ def _add_pendulum(lines: _ParameterLines, noun: str) -> None:
 
 def screw_travel(lines: Sequence[ParameterLine]) -> float:
     """Return how far the nut goes for a radian of the motor."""
-    values = {line.name: float(line.value) for line in lines if line.name in ("l", "N_p")}
+    values = {line.name: line.number for line in lines}
     return values["l"] / (2.0 * math.pi * values["N_p"])

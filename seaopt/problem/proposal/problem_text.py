@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 
@@ -118,11 +117,10 @@ def _offer_second_log(
 
 def _offer_stribeck(lines: Sequence[ParameterLine]) -> list[str]:
     """Return lines, to be taken in by hand, of friction that is larger at rest than as it slides."""
-    sliding = next((line.value for line in lines if line.name == "f_c"), "")
-    start = next(iter(re.findall(r"\d[\d.e+-]*", sliding)), "1.0")
+    sliding = next((line.number for line in lines if line.name == "f_c"), 1.0)
     return [
         "# A position stands still again and again. If friction sticks, uncomment these lines, here and in the plants:",
-        f"# f_s = {{ value = {1.5 * float(start):.3g}, free = true }}  # breakaway friction, above f_c",
+        f"# f_s = {{ value = {1.5 * sliding:.3g}, free = true }}  # breakaway friction, above f_c",
     ]
 
 
@@ -200,7 +198,7 @@ def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, intervie
     if role == "torque":
         notes.append("as a current, by K_tau, which the scale changes with")
     if role == "theta_m" and log.plant != "held" and reads_output(log):
-        scale *= next(float(line.value) for line in actuator.lines if line.name == "N")
+        scale *= next(line.number for line in actuator.lines if line.name == "N")
         interview.assume(f"gear:{column.name}")
         guesses.append("guessed: measured behind the gear, so times N")
     if scale < 0.0:
@@ -268,7 +266,7 @@ def _describe_controller(
     resonance, why = _find_resonance(logs)
     low, high = USUAL_BANDWIDTHS_HZ
     guess = min(max(5.0 * round(ABOVE_RESONANCE * resonance / 5.0), low), high) if resonance else DEFAULT_BANDWIDTH_HZ
-    band = interview.number("bandwidth_hz", "Bandwidth of the controller, in Hz", guess, why)
+    band = interview.number("bandwidth_hz", "Bandwidth of the controller", guess, why, detail=", in Hz")
     rows = [
         (f"plant = {format_toml(DESIGN)}", ""),
         (f"measured = {format_toml(actuator.measured)}", "what is regulated"),
@@ -279,7 +277,8 @@ def _describe_controller(
         rows.append((f"bandwidth_range_hz = [{min(low, band / 4.0):.3g}, {max(high, band):.3g}]", ""))
     rate = logs[0].rate_hz
     usual, why = (float(f"{rate:.4g}"), "that of the log") if rate >= LEAST_RATE_HZ else (1000.0, "a typical value")
-    sampled = interview.number("sample_rate_hz", "Rate at which the controller will run, in Hz", usual, why)
+    label = "Rate at which the controller will run"
+    sampled = interview.number("sample_rate_hz", label, usual, why, detail=", in Hz")
     rows.append((f"sample_rate_hz = {sampled:.10g}", interview.mark("sample_rate_hz")))
     delayed = any(log.traits.delay_s for log in logs)
     default = "0, as for the program that logged" if delayed else "1"
@@ -305,7 +304,7 @@ def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple
     guess = 1.0 if role == "duty" else float(f"{largest:.2g}")
     why = "the whole bridge" if role == "duty" else "the largest of the logs"
     key = "current_limit_A" if role in ("I", "torque") else "command_limit"
-    limit = interview.number(key, f"Largest {what} that the drive may give ({unit})", guess, why)
+    limit = interview.number(key, f"Largest {what} that the drive may give", guess, why, detail=f" ({unit})")
     return f"{key} = {limit:.10g}", interview.mark(key)
 
 

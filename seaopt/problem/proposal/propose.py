@@ -121,8 +121,8 @@ def propose(
     if stated.rotary is not None:
         turns = stated.rotary
     elif doubt:
-        text, guess = "Is the actuator rotary (a gear) or linear (a screw or a belt)?", "rotary" if turns else "linear"
-        turns = interview.ask("actuator", text, guess, doubt, ("rotary", "linear")) == "rotary"
+        label, guess = "Is the actuator rotary (a gear) or linear (a screw or a belt)", "rotary" if turns else "linear"
+        turns = interview.ask("actuator", label, guess, doubt, ("rotary", "linear")) == "rotary"
     assignments = [_assign(survey, interview, turns, stated) for survey in surveys]
     pairs = list(zip(surveys, assignments, strict=True))
     described = [
@@ -162,7 +162,7 @@ def _survey(path: Path, interview: Interview, stated: Stated) -> LogSurvey:
         survey = replace(survey, clocks=(stated.clock,))
     if len(survey.clocks) > 1 and survey.clock is not None:
         interview.ask(
-            key, f"Which column of {path.name} is the time?", survey.clock.name, "the first of them", survey.clocks
+            key, f"Which column of {path.name} is the time", survey.clock.name, "the first of them", survey.clocks
         )
     columns = tuple(_settle_m(column, survey, interview) for column in survey.columns)
     return replace(survey, columns=columns)
@@ -178,10 +178,11 @@ def _settle_m(column: SurveyedColumn, survey: LogSurvey, interview: Interview) -
         if geared
         else interview.ask(
             f"m:{column.name}",
-            f'Is "{column.name}" in metres, or an angle of the motor?',
+            f'Is "{column.name}" in metres',
             "metres",
             "no column is a torque, nor of a link",
             ("metres", "motor"),
+            detail=", or an angle of the motor?",
         )
     )
     return replace(column, header=read_header(column.name, metres=False)) if meaning == "motor" else column
@@ -190,7 +191,7 @@ def _settle_m(column: SurveyedColumn, survey: LogSurvey, interview: Interview) -
 def _assign(survey: LogSurvey, interview: Interview, turns: bool, stated: Stated) -> Assignment:
     """Return the roles of a log's columns, which are asked for one by one where the guess is not right."""
     roles = assign(survey, rotary=turns, given=stated.roles)
-    whole = interview.ask("roles", "Are these the right columns?", "yes", "by names and samples", ("yes", "no"))
+    whole = interview.ask("roles", "Are these the right columns", "yes", "by names and samples", ("yes", "no"))
     if whole == "yes":
         return _check_outputs(roles, survey)
     assigned = {column.name: role for role, column in roles.columns.items()}
@@ -199,7 +200,7 @@ def _assign(survey: LogSurvey, interview: Interview, turns: bool, stated: Stated
         column.name: stated.roles.get(column.name)
         or interview.ask(
             f"role:{column.name}",
-            f'What is column "{column.name}"?',
+            f'What is column "{column.name}"',
             assigned.get(column.name, "none"),
             "by its name",
             choices,
@@ -231,12 +232,12 @@ def _describe_log(
     key = f"unit:{survey.clock.name}" if survey.clock is not None else ""
     if survey.clock is not None and not sure:
         unit = interview.ask(
-            key, f'Unit of the time "{survey.clock.name}"?', unit, "by the size of its steps", ("s", "ms", "us", "ns")
+            key, f'Unit of the time "{survey.clock.name}"', unit, "by the size of its steps", ("s", "ms", "us", "ns")
         )
     clock = None
     if survey.clock is None:
-        text = f"Sample rate of {survey.name}, which has no clock, in Hz"
-        rate = interview.number(f"rate:{survey.name}", text, 1000.0, "the file has no column of times")
+        label, why = f"Sample rate of {survey.name}", "the file has no column of times"
+        rate = interview.number(f"rate:{survey.name}", label, 1000.0, why, detail=", which has no clock, in Hz")
     else:
         clock = assess_clock(survey.clock.values * factor(unit, "s"), str(survey.path))
         rate = clock.rate_hz
@@ -307,12 +308,12 @@ def _ask_units(roles: Assignment, interview: Interview, stated: Stated) -> tuple
         unit, why = guess_unit(role, column)
         _check_unit(role, unit, column.name, stated)
         if why:
-            text = f'Unit of "{column.name}" ({DESCRIPTIONS[role]})?'
-            unit = interview.ask(f"unit:{column.name}", text, unit, why, UNITS.get(role, ("rad", "deg", COUNTS)))
+            choices, detail = UNITS.get(role, ("rad", "deg", COUNTS)), f" ({DESCRIPTIONS[role]})?"
+            unit = interview.ask(f"unit:{column.name}", f'Unit of "{column.name}"', unit, why, choices, detail=detail)
         si = UNITS_OF.get(OF_INPUT.get(role) or OF_OUTPUT[role], "")
         if unit == COUNTS and si != "rad":
-            text, why = f'One step of "{column.name}", in {si}', "full scale over its steps; take it from the manual"
-            unit, scales[role] = si, interview.number(f"counts:{column.name}", text, 1e-3, why)
+            label, why = f'One step of "{column.name}"', "full scale over its steps; take it from the manual"
+            unit, scales[role] = si, interview.number(f"counts:{column.name}", label, 1e-3, why, detail=f", in {si}")
         elif unit == COUNTS:
             turn = interview.number(
                 f"counts:{column.name}", f'Steps of "{column.name}" for a whole turn', 4096.0, "a common encoder's"
@@ -362,10 +363,11 @@ def _ask_link(log: DescribedLog, interview: Interview) -> str:
     is_locked, why = is_held(roles, log.si_scale("theta_l"), log.si_scale("theta_m"))
     return interview.ask(
         key,
-        f"In {log.survey.name}, is the link held, free, or hanging (gravity pulls it back)?",
+        f"Link in {log.survey.name}",
         "held" if is_locked else "free",
         why,
         ("held", "free", "hanging"),
+        detail=": is it held, free, or hanging (gravity pulls it back)?",
     )
 
 

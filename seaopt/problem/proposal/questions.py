@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from seaopt.errors import ProblemError, suggestion
 from seaopt.formatting import printable
@@ -21,18 +22,18 @@ class Question:
     """A question that the logs leave open."""
 
     key: str  # for the answers
-    text: str  # in words, with the unit
+    label: str  # in few words, for lists
     guess: str  # what is taken where nobody answers
     why: str  # where the guess is from
     choices: tuple[str, ...] = ()  # the answers that count; empty for a number
     open: bool = False  # whether "unknown" is an answer
     usual: tuple[float, float] | None = None  # the numbers outside which an answer is doubted
+    detail: str = "?"  # what is said behind the label where it is asked: the unit, the choices
 
     @property
-    def label(self) -> str:
-        """The question in few words, for lists; of one log, with its name."""
-        first, *more = re.split(r" \(|, |\?$", self.text)
-        return f"{more[0]} in {first.removeprefix('In ')}" if first.startswith("In ") and more else first
+    def text(self) -> str:
+        """The question as it is asked."""
+        return self.label + self.detail
 
     @property
     def entry(self) -> str:
@@ -83,29 +84,25 @@ class Interview:
     def ask(
         self,
         key: str,
-        text: str,
+        label: str,
         guess: str,
         why: str = "",
         choices: Sequence[str] = (),
-        *,
-        open: bool = False,
-        usual: tuple[float, float] | None = None,
+        **options: Any,
     ) -> str:
-        """Return the answer to a question, or its guess."""
-        question = Question(key=key, text=text, guess=guess, why=why, choices=tuple(choices), open=open, usual=usual)
+        """Return the answer to a question, or its guess; `options` are further fields of `Question`."""
+        question = Question(key=key, label=label, guess=guess, why=why, choices=tuple(choices), **options)
         if all(question.key != other.key for other in self.questions):
             self.questions.append(question)
         return question.read(self.answers[key]) if key in self.answers else guess
 
-    def number(
-        self, key: str, text: str, guess: float, why: str = "", usual: tuple[float, float] | None = None
-    ) -> float:
+    def number(self, key: str, label: str, guess: float, why: str = "", *, detail: str = "", **options: Any) -> float:
         """Return a number that is always known, or guessed."""
-        return float(self.ask(key, text, f"{guess:.10g}", why, usual=usual))
+        return float(self.ask(key, label, f"{guess:.10g}", why, detail=detail, **options))
 
-    def optional(self, key: str, text: str, why: str = "", usual: tuple[float, float] | None = None) -> float | None:
+    def optional(self, key: str, label: str, why: str = "", *, detail: str = "", **options: Any) -> float | None:
         """Return a number, None where nobody knows it."""
-        answer = self.ask(key, text, UNKNOWN, why, open=True, usual=usual)
+        answer = self.ask(key, label, UNKNOWN, why, open=True, detail=f"{detail}, or {UNKNOWN}", **options)
         return None if answer == UNKNOWN else float(answer)
 
     def assume(self, key: str, why: str = "") -> None:

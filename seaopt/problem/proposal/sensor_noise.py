@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 
 from seaopt.problem.proposal.actuators import Proposed
@@ -52,9 +51,8 @@ def combine_noise(sensors: dict[str, SensorNoise], actuator: Proposed) -> float:
     """Return the standard deviation of the regulated effort's noise."""
     if actuator.measured != "tau_d":
         return max((noise.total for noise in sensors.values()), default=0.0)
-    values = {line.name: line.value for line in actuator.lines}
-    stiffness, ratio = (float(re.findall(r"\d[\d.e+-]*", values[name])[0]) for name in ("k_n", "N"))
-    weights = {"theta_m": stiffness / ratio, "theta_l": stiffness}
+    values = {line.name: line.number for line in actuator.lines}
+    weights = {"theta_m": values["k_n"] / values["N"], "theta_l": values["k_n"]}
     return math.hypot(*(weights[name] * noise.total for name, noise in sensors.items()))
 
 
