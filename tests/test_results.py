@@ -63,7 +63,10 @@ def test_results_with_a_verdict_share_its_words():
         each
         for package in (
             "seaopt",
-            *(f"seaopt.{name}" for name in ("control", "estimation", "robustness", "fleet", "logs")),
+            *(
+                f"seaopt.{name}"
+                for name in ("control", "estimation", "robustness", "fleet", "logs", "machine", "testing")
+            ),
         )
         for each in map(partial(getattr, import_module(package)), import_module(package).__all__)
         if isinstance(each, type) and ("met" in dir(each) or "met" in getattr(each, "__annotations__", {}))
@@ -72,7 +75,8 @@ def test_results_with_a_verdict_share_its_words():
     names = {each.__name__ for each in list_results()}
     assert {"Fit", "Controller", "ForceMPC", "ScheduledController", "Certificate", "Frontier", "FrontierRow",
             "SlidingAlone", "Quality", "ConstrainedRuns", "Requirement", "Simulated",
-            "Verification", "Outcome", "JointTuning", "Fleet"} <= names  # fmt: skip
+            "Verification", "Outcome", "JointTuning", "Fleet", "Acceptance", "Replay", "Response", "BringUp",
+            "Diagnostics"} <= names  # fmt: skip
 
 
 @pytest.mark.parametrize("cls", list_results(), ids=lambda cls: cls.__name__)

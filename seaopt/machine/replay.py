@@ -22,14 +22,14 @@ from seaopt.machine.response.tripped import Trip
 from seaopt.machine.stepped import FLOOR, Match, Others, Setting, Source, make_setting, play
 from seaopt.machine.stopped import find_stop
 from seaopt.machine.ticks import Ticks, find_saturated
-from seaopt.records import record
+from seaopt.records import Result, record
 
 SIGMAS = 4.0  # of what rounding allows
 HIDES = 0.003  # of the command's rms, above which what is taken for rounding may be a fault
 
 
 @record
-class Replay:
+class Replay(Result):
     """How near the law comes to the logged command."""
 
     met: bool

@@ -31,7 +31,7 @@ from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import describe_outputs
 from seaopt.estimation.uncertainty.leverage import PRIORS, Leverage, measure_leverage
-from seaopt.records import PlotAccessor, Worded, record
+from seaopt.records import PlotAccessor, Result, Worded, record
 
 SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
 LARGE = 0.05  # of an output's rms: a residual that is worth words for its colour alone
@@ -53,7 +53,7 @@ class OutputDiagnostics:
 
 
 @record(eq=False, repr=False)
-class Diagnostics(Worded):
+class Diagnostics(Result, Worded):
     """Tests of a fit; ``print(diagnostics)`` is a report.
 
     Parameters
@@ -77,7 +77,7 @@ class Diagnostics(Worded):
     """
 
     plot = PlotAccessor()
-    json_keys = ("outputs", "leverage", "at_bound", "held", "aic", "bic", "sentences")
+    json_keys = ("met", "outputs", "leverage", "at_bound", "held", "aic", "bic", "sentences")
 
     outputs: Mapping[str, Mapping[str, OutputDiagnostics]]
     leverage: Mapping[str, Leverage]
@@ -90,7 +90,7 @@ class Diagnostics(Worded):
     residuals: ResidualsByExperiment = field(default_factory=dict[str, ExperimentResiduals], repr=False)
 
     @property
-    def ok(self) -> bool:
+    def met(self) -> bool:
         """Whether no problem was found."""
         return not self.sentences
 

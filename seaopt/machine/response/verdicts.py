@@ -47,7 +47,7 @@ from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import Blocks
 from seaopt.machine.response.reach import Band, find_missing, find_reach
 from seaopt.plants.friction import find_dry_friction, split_friction
-from seaopt.records import record
+from seaopt.records import Result, record
 
 LEAST_PHASES = 6  # sets of phases, with dry friction
 SAME_GAIN = 0.1  # relative, between two amplitudes
@@ -81,7 +81,7 @@ class AgainstFriction:
 
 
 @record(eq=False)
-class Response(AgainstFriction):
+class Response(AgainstFriction, Result):
     """The measured loop, and its limits."""
 
     met: bool

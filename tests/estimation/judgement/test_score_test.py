@@ -84,7 +84,7 @@ def test_a_stiffness_held_20_percent_off_is_named_and_not_the_models_structure(b
         assert value == pytest.approx(true, abs=4 * std)
         assert std == pytest.approx(again.parameters[name].std, rel=0.3)
         assert found.held[name].chi2 == pytest.approx(2 * (again.log_likelihood - fit.log_likelihood), rel=0.1)
-        assert diagnose(again).ok
+        assert diagnose(again).met
     assert json.loads(to_json(found.to_dict()))["held"]["k"]["value"] == 1.2 * thor["k"].value
     assert "k = 786000 N/m held fixed: chi-square" in repr(found)
 
