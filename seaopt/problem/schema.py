@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
+    AliasChoices,
     BeforeValidator,
     ConfigDict,
     Discriminator,
@@ -258,7 +259,9 @@ class FiguresTable(_make_figures("LoopFiguresTable", FIGURES)):
 class ExpectedControllerTable(FiguresTable):
     """Figures of the tuned controller on its design plant."""
 
-    feasible: Flag = key("Every limit of [controller] is met.", default=True)
+    met: Flag = key(
+        "Every limit of [controller] is met.", default=True, validation_alias=AliasChoices("met", "feasible")
+    )
 
 
 class ExpectedPlantTable(_make_figures("WorstFiguresTable", WORST_FIGURES, FiguresTable)):
@@ -268,7 +271,7 @@ class ExpectedPlantTable(_make_figures("WorstFiguresTable", WORST_FIGURES, Figur
 class ExpectedCertificateTable(StrictTable):
     """What the certificate is to say."""
 
-    passed: Flag = key("Every requirement is met.", default=True)
+    met: Flag = key("Every requirement is met.", default=True, validation_alias=AliasChoices("met", "passed"))
     failure_probability: Number | None = key("Its bound; at most.", default=None)
     plants: dict[Name, ExpectedPlantTable] = key("Figures of a certified plant's loop, by its name.", default={})
 

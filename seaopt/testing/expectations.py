@@ -111,11 +111,11 @@ def list_expectations(problem: Problem) -> list[Expectation]:
             name = ".".join(filter(None, ("fit_percent", experiment, output)))
             add("fit", name, _judge_percent, experiment, output, ends)
     if expect.controller is not None:
-        add("controller", "controller.feasible", _judge_met, "controller", expect.controller.feasible)
+        add("controller", "controller.met", _judge_met, "controller", expect.controller.met)
         for figure, ends in _list_limits(expect.controller):
             add("controller", f"controller.{figure}", _judge_design, figure, ends)
     if expect.certificate is not None:
-        add("certificate", "certificate.passed", _judge_met, "certificate", expect.certificate.passed)
+        add("certificate", "certificate.met", _judge_met, "certificate", expect.certificate.met)
         if expect.certificate.failure_probability is not None:
             most = expect.certificate.failure_probability
             add("certificate", "certificate.failure_probability", _judge_probability, most)

@@ -75,7 +75,7 @@ def test_a_number_is_the_limit_on_the_bad_side(figure, check, made):
     better, worse = (value - hair, value + hair) if figure in DOWNWARDS else (value + hair, value - hair)
     for asked, met in ((better, False), (worse, True)):
         found = check(f"[expect.controller]\n{figure} = {asked!r}\n")
-        assert found["controller.feasible"][0] and found[f"controller.{figure}"][0] is met
+        assert found["controller.met"][0] and found[f"controller.{figure}"][0] is met
         text = found[f"controller.{figure}"][1]
         assert float(text.split("found ")[1].split()[0].rstrip(",")) == pytest.approx(value, rel=1e-3)
         assert ("; " in text) is not met
@@ -111,9 +111,16 @@ def test_the_certificate_and_its_bound_are_expected(check, made):
     for asked, met in ((bound * 1.01, True), (bound * 0.99, False)):
         found = check(f"[expect.certificate]\nfailure_probability = {asked!r}\n")
         assert found["certificate.failure_probability"][0] is met
-        assert found["certificate.passed"][0] is made.certificate.passed
-    turned = check(f"[expect.certificate]\npassed = {str(not made.certificate.passed).lower()}\n")
-    assert turned["certificate.passed"][0] is False
+        assert found["certificate.met"][0] is made.certificate.met
+    turned = check(f"[expect.certificate]\nmet = {str(not made.certificate.met).lower()}\n")
+    assert turned["certificate.met"][0] is False
+
+
+@pytest.mark.parametrize(("stage", "older"), [("controller", "feasible"), ("certificate", "passed")])
+def test_the_older_word_for_met_is_still_read(stage, older, check):
+    for word in (older, "met"):
+        found = check(f"[expect.{stage}]\n{word} = true\n"), check(f"[expect.{stage}]\n{word} = false\n")
+        assert {each[f"{stage}.met"][0] for each in found} == {True, False}
 
 
 def test_a_plant_that_is_not_certified_says_where_to_name_it(check):
