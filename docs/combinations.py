@@ -119,7 +119,6 @@ here, and run the whole table.
 - A law designed on `frf:` is simulated on the plants that it is certified on. What no response tells, heat, friction and the largest step of a reading, is of the model of the plant that was measured.
 - What feeds back the motion of motor or link on a law designed on `frf:`, friction compensated from the speed or the weight of the link, is shown to be stable on models: name them in `[robustness] plants`.
 - A sweep of predictive control has its linear region, in which no limit is active.
-- Predictive control and `link_feedforward` exclude each other for want of code alone: the plan leaves room for what is added to its command. All other refusals are for what their reasons say.
 - A sweep is run, and nothing of it is exported.
 - The impedance has a number for its damping: `"critical"` is refused where something in the loop swings more slowly than the link.
 

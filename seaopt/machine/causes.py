@@ -441,8 +441,6 @@ def _change_law(*, linear: bool = False, **changes: Any) -> Callable[[Setting], 
     def change(setting: Setting) -> Setting:
         before = setting.linear if linear else setting.law
         law = replace(before, **changes)
-        if isinstance(before, ForceMPC) or isinstance(law, ForceMPC):
-            return replace(setting, law=law)
         read = [before.further.index(name) for name in law.further]
         return replace(setting, law=law, ticks=replace(setting.ticks, further=setting.ticks.further[:, read]))
 

@@ -138,10 +138,9 @@ def _run_plan(
 ) -> tuple[Float[np.ndarray, " n"], MPCState]:
     """Return the commands of predictive control, and its last state; `follow`: as if each command were the log's."""
     out, ahead = np.empty(len(ticks)), law.spec.preview_samples + 1
-    reads = 0 if law.compensation is None else len(law.compensation.reads)
-    for k in range(len(ticks)):
+    rows, names = np.column_stack([ticks.further, ticks.measured]), (*law.further, *law.signals)
+    for k, readings in enumerate(rows[:, [names.index(name) for name in law.reads]].tolist()):
         before = state.kalman
-        readings = ticks.further[k, :reads].tolist()
         result = law.step(state, ticks.reference[k : k + ahead], float(ticks.measured[k, 0]), readings)
         out[k], state = result.current_A, result.state
         if follow:
@@ -200,7 +199,7 @@ def limit_law(law: RunnableLaw | RunnableSchedule | ForceMPC, limit: float) -> A
 def change_plan(plan: ForceMPC, spec: MPCSpec) -> ForceMPC:
     """Return predictive control of another specification, with the same around it."""
     changed = force_mpc(*plan.design, spec, gate=plan.gate, heat=plan.heat)
-    return replace(changed, outer=plan.outer, compensation=plan.compensation)
+    return replace(changed, outer=plan.outer, compensation=plan.compensation, link=plan.link)
 
 
 def limit_spec(spec: Spec, limit: float) -> Spec:

@@ -18,6 +18,7 @@ from seaopt.control import (
     ForceMPC,
     Frontier,
     GivenLaw,
+    LinkFeedforward,
     ScheduledController,
     assess,
     command_of,
@@ -45,6 +46,7 @@ from seaopt.problem.completion import (
     make_gate,
     surround_controller,
 )
+from seaopt.problem.option_tables import make_value
 from seaopt.problem.problem import WRITE_ONE, Problem
 from seaopt.progress import Progress, count_off, ignore
 from seaopt.robustness import (
@@ -52,6 +54,7 @@ from seaopt.robustness import (
     Certificate,
     JointTuning,
     certify,
+    feed_link_forward,
     linear_controller,
     tune_certified,
 )
@@ -154,6 +157,10 @@ def design_mpc(problem: Problem, source: Fit | ParameterSet) -> ForceMPC:
     mpc = force_mpc(problem.design_plant, source, problem.mpc)
     heat = mpc.heat_guard if derates(problem, mpc) else None
     mpc = replace(mpc, gate=make_gate(problem, mpc, source), heat=heat)
+    feedforward = make_value(problem.controller_table.link_feedforward, LinkFeedforward | None)
+    if feedforward is not None:
+        plants = {name: (plant, problem.values(source)) for name, plant in problem.certified_plants().items()}
+        mpc = feed_link_forward(mpc, feedforward, plants)
     if problem.table.impedance is None and not problem.controller_table.compensate:
         return mpc
     law = surround_controller(problem, linear_controller(mpc), source)

@@ -5,7 +5,7 @@ from seaopt.robustness.bounds.stretch import StretchBound
 from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
-from seaopt.robustness.certificate.linear_region import linear_controller
+from seaopt.robustness.certificate.linear_region import feed_link_forward, linear_controller
 from seaopt.robustness.certificate.requirement import Requirement
 from seaopt.robustness.certificate.retuning.joint import JointTuning, Round, tune_certified
 from seaopt.robustness.certificate.simulated import Simulated, run_simulations
@@ -26,7 +26,7 @@ __all__ = [
     "MonteCarlo", "Outcome", "Phase", "PlantMargins", "Requirement", "Round", "Scenario",
     "Simulated", "StabilityMap", "StretchBound", "Sweep", "Uncertainty", "Verification",
     "Witness", "Worst", "batch_figures", "bracket", "certify", "check_ranges",
-    "combine_uncertainty", "coupled_stability", "default_scenarios", "failure_bound", "large_signal",
-    "linear_controller", "place_value", "plant_margins", "run_simulations", "sweep_schedule", "tune_certified",
-    "verify",
+    "combine_uncertainty", "coupled_stability", "default_scenarios", "failure_bound", "feed_link_forward",
+    "large_signal", "linear_controller", "place_value", "plant_margins", "run_simulations", "sweep_schedule",
+    "tune_certified", "verify",
 ]  # fmt: skip

@@ -113,7 +113,7 @@ class Bench:
                 columns | {self.controller.over: places},
                 units | {self.controller.over: self.controller.unit},
             )
-        elif further := law.further if isinstance(law, Controller) else law.compensation and law.compensation.reads:
+        elif further := law.further if isinstance(law, Controller) else law.reads:
             columns, units = columns | {further[0]: place}, units | {further[0]: "m"}
         return so.Log.from_arrays(**columns, units=units, source="bench")
 

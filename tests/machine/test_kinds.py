@@ -19,7 +19,8 @@ from seaopt.control import (
     tune_schedule,
 )
 from seaopt.control.laws.structures import Gains
-from seaopt.control.loops.compensation.terms import Compensation, GravityTerm
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
+from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
 from seaopt.control.running.law_step import run_law
 from seaopt.formatting import format_number
 from seaopt.machine.design_run import run_design
@@ -241,6 +242,37 @@ def test_a_weight_beside_predictive_control_is_replayed_and_missed(planned, limi
     assert row.causes[0].explains
     lower = limit_law(mpc, 4.5)
     assert lower.command_limit == 4.5 and lower.compensation.gravity == weight
+
+
+def test_a_link_fed_forward_beside_predictive_control_is_replayed_and_missed(planned, compiler, tmp_path):
+    numbers = {"inertia": 100.0, "damping": 4e3, "fraction": 0.4, "corner_hz": 20.0, "high_pass_hz": 2.0}
+    path = LinkPath(measured="q", unit="m", is_speed=False, **numbers)
+    mpc = replace(planned.controller, link=path)
+    log = Bench(compiler, tmp_path, mpc).log(Machine(), SHORT[:1000])
+    (row,) = so.accept(mpc, [log]).replays
+    assert row.met and row.largest < 1e-6
+    force = planned.log(Machine(), SHORT[:1000])
+    columns = {name: force[name] for name in ("reference", "F1", "I")} | {"q": force["F1"] / 655e3}
+    (row,) = so.accept(mpc, [so.Log.from_arrays(time=force.time, source="bench", **columns)]).replays
+    assert not row.met and (row.causes[0].kind, row.causes[0].what) == ("feedforward", "link"), row.causes
+    assert row.causes[0].explains and limit_law(mpc, 4.5).link == path
+
+
+def test_of_two_terms_beside_predictive_control_the_one_left_out_is_named(planned, compiler, tmp_path):
+    """Each reads an output of its own: without the first, the second is given its own still."""
+    period = planned.controller.sample_time_s
+    weight = GravityTerm(coefficients=(4.0, 150.0), low=-1e-3, high=1e-3, reads="q", unit="m", fraction=1.0)
+    steady = {"effort": 20.0, "speed": 1.0, "speed_unit": "m/s", "fraction": 1.0, "velocity_per_rate": 1e-3}
+    rubbing = FrictionTerm(source="speed", reads="F2", **steady)
+    mpc = replace(planned.controller, compensation=Compensation(sample_time_s=period, gravity=weight))
+    log = Bench(compiler, tmp_path, mpc).log(Machine(), SHORT[:1000])
+    both = replace(mpc, compensation=replace(mpc.compensation, friction=rubbing))
+    assert both.reads == ("F2", "q")
+    columns = {name: log[name] for name in ("reference", "F1", "I", "q")}
+    columns["F2"] = np.cumsum(np.random.default_rng(1).normal(size=1000))
+    (row,) = so.accept(both, [so.Log.from_arrays(time=log.time, source="bench", **columns)]).replays
+    assert not row.met and (row.causes[0].kind, row.causes[0].what) == ("compensation", "friction"), row.causes
+    assert row.causes[0].explains
 
 
 @pytest.mark.slow

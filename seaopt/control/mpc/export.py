@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from seaopt.codec import Constraints, Fields, to_content
 from seaopt.control.laws.plausibility import PlausibilityGate
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
@@ -21,6 +22,7 @@ from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
 from seaopt.control.mpc.quadratic_program import PENALTY, WIDE, factor_program, stack_hessian
+from seaopt.control.mpc.step import find_rest_gain
 from seaopt.files import plain, write_text
 from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.records import record
@@ -43,6 +45,7 @@ class MPCCode:
     heat: HeatGuard | None = None
     outer: OuterLoop | None = None
     terms: Annotated[Mapping[str, Any], Fields(of=Compensation)] | None = None
+    link: LinkPath | None = None
 
     @property
     def compensation(self) -> Compensation | None:
@@ -55,7 +58,7 @@ class MPCCode:
         heat, outer, terms = self.heat, self.outer, self.compensation
         files = {
             "heat.h": heat and _format_heat(heat), "outer.h": outer and _format_outer(outer),
-            "terms.h": terms and _format_terms(terms),
+            "terms.h": _format_terms(terms, self.link, self.numbers),
         }  # fmt: skip
         return {name: text for name, text in files.items() if text}
 
@@ -128,10 +131,13 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "UNIT": mpc.design[0].outputs[mpc.measured],
         "DELAYS": mpc.delays,
     }
-    if (terms := mpc.compensation) is not None:
-        numbers |= {"per_effort": mpc.per_effort, "sample_time_s": terms.sample_time_s}
-        read = {**mpc.design[0].outputs, **{term.reads: term.unit for term in (terms.gravity, terms.ripple) if term}}
-        units["READ"] = ", ".join(f"{name} in {read[name]}" if read.get(name) else name for name in terms.reads)
+    terms, link = mpc.compensation, mpc.link
+    if terms is not None or link is not None:
+        placed = (terms.gravity, terms.ripple) if terms else ()
+        read = {**mpc.design[0].outputs, **{term.reads: term.unit for term in placed if term}}
+        read |= {link.measured: link.unit} if link else {}
+        numbers |= {"per_effort": mpc.per_effort, "sample_time_s": spec.sample_time_s}
+        units["READ"] = ", ".join(f"{name} in {read[name]}" if read.get(name) else name for name in mpc.reads)
     code = MPCCode(
         sizes=sizes,
         numbers={name: value for name, value in numbers.items() if np.isfinite(value)},
@@ -141,6 +147,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         rows=prediction.rows,
         outer=mpc.outer,
         terms=terms and {name: getattr(terms, name) for name in terms.json_keys},
+        link=link,
     )
     return set_heat(set_gate(code, mpc.gate, spec.sample_time_s), mpc.heat)
 
@@ -166,9 +173,7 @@ def _format_data(code: MPCCode, single_precision: bool, uncertified: str) -> str
     numbers = {**code.numbers, "tolerance": tolerance, "dependent": dependent}
     arrays = {**code.arrays, "inverse": program.inverse, "normals": program.normals, "scale": program.scale}
     lines = [f"typedef {'float' if single_precision else 'double'} force_mpc_real;"]
-    lines += [
-        f"#define FORCE_MPC_{name} {value}" for name, value in {**code.sizes, **_place_terms(code.compensation)}.items()
-    ]
+    lines += [f"#define FORCE_MPC_{name} {value}" for name, value in {**code.sizes, **_place_terms(code)}.items()]
     lines += [f'#define FORCE_MPC_{name} "{text}"' for name, text in code.units.items()]
     lines += [f"static const force_mpc_real mpc_{name} = {_format_number(value)};" for name, value in numbers.items()]
     lines += [_format_array(name, value) for name, value in arrays.items()]
@@ -209,32 +214,47 @@ def _format_outer(outer: OuterLoop) -> str:
     return _format_part(outer.describe(), numbers, "outer.c")
 
 
-def _format_terms(terms: Compensation) -> str:
-    """Return what is compensated as C: the numbers of each term."""
+def _format_terms(terms: Compensation | None, link: LinkPath | None, given: Mapping[str, float]) -> str:
+    """Return what is added to a plan as C: the numbers of each term, and of what feeds the link back."""
     numbers, texts = dict[str, float | Sequence[float]](), list[str]()
-    if terms.gravity is not None:
+    if terms is None and link is None:
+        return ""
+    if terms is not None and terms.gravity is not None:
         middle, scale, *series = terms.gravity.numbers
         numbers |= {"GRAVITY": series, "GRAVITY_MIDDLE": middle, "GRAVITY_SCALE": scale}
         texts.append("gravity.c")
-    if terms.ripple is not None:
+    if terms is not None and terms.ripple is not None:
         cos, sin = zip(*terms.ripple.harmonics, strict=True)
         numbers |= {"RIPPLE_COS": cos, "RIPPLE_SIN": sin, "SINE": SINE, "COSINE": COSINE}
         numbers |= {"REVOLUTIONS": terms.ripple.numbers[0], "MOST_TURNS": MOST_TURNS, "QUARTER": 0.5 * math.pi}
         texts.append("ripple.c")
-    if terms.friction is not None:
+    if terms is not None and terms.friction is not None:
         share = terms.friction.share_per_step(terms.sample_time_s)
         numbers |= {"FRICTION_EFFORT": terms.friction.effort, "FRICTION_SHARE": share}
-    return _format_part("What is compensated", numbers, *texts)
+    if link is not None:
+        path = link.feedback(given["sample_time_s"])
+        numbers |= {"LINK_NUM": path.num.tolist(), "LINK_DEN": path.den.tolist(), "LINK_REST": find_rest_gain(path)}
+    return _format_part("What is added", numbers, *texts)
 
 
-def _place_terms(terms: Compensation | None) -> dict[str, int]:
+def _place_terms(code: MPCCode) -> dict[str, int]:
     """Return which reading each term reads, from 1 on, and 0 for none; friction's from 2 on, 1 for the reference."""
-    if terms is None:
-        return {"TERMS": 0}
-    placed = {None: 0, "": 0} | {name: 1 + i for i, name in enumerate(terms.reads)}
-    gravity, ripple = (placed[term and term.reads] for term in (terms.gravity, terms.ripple))
-    friction = 0 if terms.friction is None else 1 + placed[terms.friction.reads]
-    return {"TERMS": 1, "READINGS": len(terms.reads), "GRAVITY": gravity, "RIPPLE": ripple, "FRICTION": friction}
+    terms, link = code.compensation, code.link
+    if terms is None and link is None:
+        return {"TERMS": 0, "LINK": 0}
+    linked = () if link is None else (link.measured,)
+    reads = dict.fromkeys((*(terms.reads if terms else ()), *linked))
+    placed: Mapping[str | None, int] = {None: 0, "": 0} | {name: 1 + i for i, name in enumerate(reads)}
+    gravity, ripple, friction = (terms.gravity, terms.ripple, terms.friction) if terms else (None, None, None)
+    return {
+        "TERMS": 1,
+        "READINGS": len(reads),
+        "GRAVITY": placed[gravity and gravity.reads],
+        "RIPPLE": placed[ripple and ripple.reads],
+        "FRICTION": 0 if friction is None else 1 + placed[friction.reads],
+        "LINK": placed[link and link.measured],
+        "LINK_ORDER": 0 if link is None else link.feedback(code.numbers["sample_time_s"]).den.size - 1,
+    }
 
 
 def _format_part(said: str, numbers: Mapping[str, float | Sequence[float]], *texts: str) -> str:

@@ -32,7 +32,6 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.command import Command, command_of, limit_notes
-from seaopt.control.laws.controller import ClosesLoops
 from seaopt.control.laws.delay import settle_delays, warn_delays
 from seaopt.control.laws.friction import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
@@ -40,6 +39,7 @@ from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.realisation import check_guards
 from seaopt.control.laws.verdict import LimitVerdict, explain_broken, judge_all, list_broken, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin
+from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop, LoopFigures
@@ -60,7 +60,15 @@ from seaopt.control.mpc.quadratic_program import (
     stack_hessian,
 )
 from seaopt.control.mpc.spec import MPCSpec
-from seaopt.control.mpc.step import MPCState, MPCStep, add_terms, read_references, shape_references
+from seaopt.control.mpc.step import (
+    MPCState,
+    MPCStep,
+    ReadsLink,
+    add_terms,
+    put_behind,
+    read_references,
+    shape_references,
+)
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
@@ -72,19 +80,18 @@ from seaopt.plants.motor.heat_guard import HeatGuard
 from seaopt.plants.motor.thermal import freeze_heat, rate_motor
 from seaopt.plants.plant import name_input, require_plant
 from seaopt.records import Result, Worded, record
-from seaopt.units import unit_after
 
 References = Float[np.ndarray, " r"]
 State = Float[np.ndarray, " n"]  # z of the filter
 PerRow = Float[np.ndarray, " m"]  # of the program
 VIOLATION = 1e-2  # of the limits; a solution further outside is not used
 LOWEST_SHARE = 7.0  # of the bandwidth asked: down to a seventh of it one that is possible is looked for
-AROUND = ("gate", "heat", "outer", "compensation", "warnings")  # fields of what stands around the plan
+AROUND = ("gate", "heat", "outer", "compensation", "link", "warnings")  # fields of what stands around the plan
 SENSOR = 1.0 / 120.0  # default sensor noise per static gain: the filter is then quick, and the loop's Ms moderate
 
 
 @record(eq=False, repr=False)
-class ForceMPC(ClosesLoops, Result, Worded):
+class ForceMPC(ReadsLink, Result, Worded):
     """A force controller within limits; `force_mpc` makes one.
 
     Parameters
@@ -114,6 +121,8 @@ class ForceMPC(ClosesLoops, Result, Worded):
         comes before this one's.
     compensation : Compensation, optional
         What is added to reference and command (`seaopt.control.add_compensation`), whose sum the plan keeps in limits.
+    link : LinkPath, optional
+        What is added to the command of the link's motion (`seaopt.robustness.feed_link_forward`), likewise.
     warnings : tuple of str
         What is doubtful, such as a delay that is too short.
     """
@@ -131,6 +140,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
     heat: HeatGuard | None = None
     outer: OuterLoop | None = None
     compensation: Compensation | None = None
+    link: LinkPath | None = None
     warnings: tuple[str, ...] = ()
     memory: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)  # of what follows from the fields
 
@@ -240,8 +250,8 @@ class ForceMPC(ClosesLoops, Result, Worded):
         """One line: the limits that block, and the bandwidth that is possible; empty where every limit is met."""
         if self.met:
             return ""
-        design, loop = self.measured_loops[0], next(iter(self.loops.values()))
-        blocked = shorten_blocked(explain_broken(self.spec, self.verdicts, design, loop))
+        loop = next(iter(self.loops.values()))
+        blocked = shorten_blocked(explain_broken(self.spec, self.verdicts, self.measured_loops[0], loop))
         remedy = (
             f"{self.possible_hz:.4g} Hz is possible"
             if self.possible_hz is not None
@@ -262,7 +272,8 @@ class ForceMPC(ClosesLoops, Result, Worded):
         chosen = self.spec.reference_filter
         if chosen is None:
             return ()
-        bare = replace(self.close(*self.design), law=self._plan).figures().bandwidth_hz
+        plan = self.unlimited().scaled(1.0 / self.per_effort)
+        bare = replace(self.close(*self.design), law=plan).figures().bandwidth_hz
         kind = chosen.order.replace("_", " ")
         return (f"prefilter of {kind} at {chosen.corner_hz:.4g} Hz; without it the bandwidth is {bare:.4g} Hz",)
 
@@ -294,7 +305,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
         measurement_N : float
             The measured force.
         readings : sequence of float
-            Of what the compensation, where there is one, reads; where one is not finite, it adds what it did last.
+            Of `reads`; where one is not finite, what is added is that of the last sample.
 
         Raises
         ------
@@ -303,7 +314,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
         """
         began = time.perf_counter()
         references, shaped = read_references(reference_N, self.spec.preview_samples), state.shaped
-        terms = add_terms(self.compensation, state.terms, references, readings)
+        terms = add_terms(self.compensation, self.link_filter, state.terms, references, readings)
         references = references + terms[0]
         if self.spec.low_pass is not None:
             references, shaped = shape_references(self.spec.low_pass, shaped, references)
@@ -313,7 +324,7 @@ class ForceMPC(ClosesLoops, Result, Worded):
             _, seen = self.gate.screen(seen, measurement_N)
             measurement_N = np.nan if seen.held else measurement_N
         measurement_N = measurement_N if is_number(measurement_N) else np.nan
-        terms = (terms[0], 0.0, terms[2]) if seen.fault else terms
+        terms = (terms[0], 0.0, *terms[2:]) if seen.fault else terms
         added = terms[1] * self.per_effort  # which the model has no part of, nor of the friction that it meets
         corrected, innovation, ahead = self._observe(state.kalman, measurement_N)
         drift, before = float(ahead[-1]), last - state.terms[1] * self.per_effort
@@ -451,25 +462,11 @@ class ForceMPC(ClosesLoops, Result, Worded):
         )
 
     @property
-    def _plan(self) -> Law:
-        """The plan as long as no limit is active, to effort."""
-        return self.unlimited().scaled(1.0 / self.per_effort)
-
-    @property
     def law(self) -> Law:
         """What it is while no limit is active, from reference and measurement to effort."""
-        plan, low_pass = self._plan, self.spec.low_pass
-        if low_pass is None:
-            return plan
-        inner, into, seen, direct = low_pass.state_space()
-        a = np.block([[plan.a, np.outer(plan.b[:, 0], seen)], [np.zeros((into.size, plan.c.size)), inner]])
-        b = np.vstack([plan.b * [direct, 1.0], np.column_stack([into, 0.0 * into])])
-        return replace(plan, a=a, b=b, c=np.append(plan.c, plan.d[0] * seen), d=plan.d * [direct, 1.0])
-
-    def describe_limits(self) -> str:
-        """Return the limits of the command and its rate, as text."""
-        slew, rate = self.spec.current_slew_A_per_s, f"{unit_after(self.actuation.unit) or ' 1'}/s"
-        return self.actuation.show(self.command_limit) + ("" if slew is None else f", {slew:g}{rate}")
+        plan, low_pass = self.unlimited().scaled(1.0 / self.per_effort), self.spec.low_pass
+        law = plan if low_pass is None else put_behind(plan, low_pass)
+        return law if self.link_filter is None else law.reading(self.link_filter[0])
 
 
 def force_mpc(

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from seaopt.control.laws.controller import ClosesLoops
 from seaopt.control.laws.plausibility import GateState, is_number
 from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import EstimatorState
 from seaopt.errors import ControlError
+from seaopt.plants import Plant
+from seaopt.plants.memo import memo
 from seaopt.plants.motor.heat_guard import COLD
 from seaopt.records import record
 
-Added = tuple[float, float, Memory]
+Added = tuple[float, float, Memory, tuple[float, ...]]
 
 
 @record(eq=False)
@@ -39,8 +45,9 @@ class MPCState:
         Winding and case above the ambient, K, as the heat guard, where there is one, estimates them.
     shaped : tuple of float
         What the prefilter, where there is one, keeps.
-    terms : (float, float, (float, float))
-        What a compensation, where there is one, added to the reference and as effort, and what it remembers.
+    terms : (float, float, (float, float), tuple of float)
+        What a compensation and a link's feedforward, where there are any, added to the reference and as effort, and
+        what each remembers; of the link nothing before the first reading.
     """
 
     kalman: EstimatorState
@@ -51,7 +58,7 @@ class MPCState:
     gate: GateState = GateState()
     heat: tuple[float, float] = COLD
     shaped: tuple[float, ...] = ()
-    terms: Added = (0.0, 0.0, FORGOTTEN)
+    terms: Added = (0.0, 0.0, FORGOTTEN, ())
 
 
 @record(eq=False)
@@ -92,15 +99,84 @@ class MPCStep:
     step_time_s: float
 
 
+class ReadsLink(ClosesLoops):
+    """What predictive control reads besides the force: what its terms do, and the link where that is fed forward."""
+
+    __slots__ = ()
+    measured: Any
+    compensation: Any
+    link: Any
+    memory: Any
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The outputs that its law reads, the regulated one first."""
+        return (self.measured,) if self.link is None else (self.measured, self.link.measured)
+
+    @property
+    def further(self) -> tuple[str, ...]:
+        """The outputs that its terms read besides."""
+        return () if self.compensation is None else self.compensation.reads
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """What a step reads besides the force."""
+        return tuple(dict.fromkeys((*self.further, *self.signals[1:])))
+
+    @property
+    @memo
+    def link_filter(self) -> tuple[TransferFunction, int] | None:
+        """What feeds the link back, and which reading that is; None where it is not."""
+        link = self.link
+        return None if link is None else (link.feedback(self.sample_time_s), self.reads.index(link.measured))
+
+    def see(self, plant: Plant) -> Plant:
+        """Return a plant with every signal that is read."""
+        return plant if self.link is None else self.link.see(plant)
+
+
 def add_terms(
-    terms: Compensation | None, last: Added, references: Float[np.ndarray, " p"], readings: Sequence[float]
+    terms: Compensation | None,
+    link: tuple[TransferFunction, int] | None,
+    last: Added,
+    references: Float[np.ndarray, " p"],
+    readings: Sequence[float],
 ) -> Added:
-    """Return what terms add in a sample, and remember; as in the last one where a reading is no number."""
-    if terms is None or not all(map(is_number, readings)):
+    """Return what terms add in a sample, and remember; as in the last one where a reading is no number. `link`: what
+    feeds a link back, and which reading that is; it begins at rest at the first.
+    """
+    if not all(map(is_number, readings)):
         return last
-    reference = float(references[0])
-    shaped, effort, memory = terms.step(last[2], reference, readings)
-    return shaped - reference, effort, memory
+    weight, effort, memory, kept = 0.0, 0.0, FORGOTTEN, last[3]
+    if terms is not None:
+        reference = float(references[0])
+        shaped, effort, memory = terms.step(last[2], reference, readings[: len(terms.reads)])
+        weight = shaped - reference
+    if link is not None:
+        path, at = link
+        kept = kept or rest_filter(path, readings[at])
+        fed, kept = shape_references(path, kept, np.array([readings[at]]))
+        effort -= float(fed[0])
+    return weight, effort, memory, kept
+
+
+def rest_filter(path: TransferFunction, value: float) -> tuple[float, ...]:
+    """Return what a filter keeps at rest at a value (transposed form)."""
+    still = path.num - path.den * find_rest_gain(path)
+    return tuple((value * np.cumsum(still[:0:-1])[::-1]).tolist())
+
+
+def find_rest_gain(path: TransferFunction) -> float:
+    """Return a filter's gain at rest."""
+    return float(np.sum(path.num) / np.sum(path.den))
+
+
+def put_behind(law: Law, low_pass: TransferFunction) -> Law:
+    """Return a law whose reference is behind a low-pass."""
+    inner, into, seen, direct = low_pass.state_space()
+    a = np.block([[law.a, np.outer(law.b[:, 0], seen)], [np.zeros((into.size, law.c.size)), inner]])
+    b = np.vstack([law.b * [direct, 1.0], np.column_stack([into, 0.0 * into])])
+    return replace(law, a=a, b=b, c=np.append(law.c, law.d[0] * seen), d=law.d * [direct, 1.0])
 
 
 def shape_references(

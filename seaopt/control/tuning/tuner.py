@@ -267,7 +267,7 @@ def make_task(
             raise ControlError(f"robust_to: {name} is a tuple of {len(pair)}; give a plant, or (plant, parameters)")
         require_plant(pair[0], f"robust_to: {name}", ControlError)
         named[str(name)] = (pair[0], place_drive_delay(spec, pair[1], late)) if pair is other else pair
-    link = _find_link(spec, named, gain)
+    link = find_link(spec, named, gain)
     if link is not None:
         named = {name: (link.see(model), params) for name, (model, params) in named.items()}
         design, signals = link.see(design), (*signals, link.measured)
@@ -299,7 +299,7 @@ def make_task(
     speed_loop = spec.find_speed_loop(signals)
     further: tuple[TransferFunction | SpeedLoop, ...] = () if speed_loop is None else (speed_loop,)
     if link is not None:
-        link = _limit_fraction(link, spec, plants)
+        link = choose_fraction(link, spec, plants)
         further = (*further, link.feedback(spec.sample_time_s))
     return Task(
         spec=spec,
@@ -328,7 +328,7 @@ def _check_cascade(spec: ControllerSpec, design: Plant) -> None:
         )
 
 
-def _find_link(
+def find_link(
     spec: ControllerSpec, named: Mapping[str, tuple[Plant, ParameterSet]], per_effort: float
 ) -> LinkPath | None:
     """Return the path from the link's motion, of the first plant whose link moves; None where none is requested. Raises
@@ -348,7 +348,7 @@ def _find_link(
     )
 
 
-def _limit_fraction(link: LinkPath, spec: ControllerSpec, plants: Sequence[DigitalPlant | MeasuredPlant]) -> LinkPath:
+def choose_fraction(link: LinkPath, spec: ControllerSpec, plants: Sequence[DigitalPlant | MeasuredPlant]) -> LinkPath:
     """Return the path with the largest fraction that may be, where none is stated."""
     if spec.link_feedforward is None or spec.link_feedforward.fraction is not None:
         return link
@@ -367,7 +367,7 @@ def aim_task(task: Task, spec: ControllerSpec) -> Task:
     task, feedforward = replace(task, spec=spec), spec.link_feedforward
     if feedforward is None or task.link is None:
         return task
-    return feed_link(task, _limit_fraction(feedforward.place(task.link, spec.bandwidth_hz), spec, task.plants))
+    return feed_link(task, choose_fraction(feedforward.place(task.link, spec.bandwidth_hz), spec, task.plants))
 
 
 def _find_nominal(

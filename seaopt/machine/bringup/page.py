@@ -175,7 +175,8 @@ def _describe_stage(stage: Stage) -> Section:
     held = f"Keep {source.over} at {format_number(stage.place)}." if isinstance(source, ScheduledController) else ""
     begin, ring = BEGIN.format(stage.name), f" ({stage.name}/force_law_log.c does)"
     if isinstance(source, ForceMPC):
-        terms = "" if source.compensation is None else ", call force_mpc_terms before each force_mpc_step"
+        added = source.compensation is not None or source.link is not None
+        terms = ", call force_mpc_terms before each force_mpc_step" if added else ""
         begin, ring = f"begin with force_mpc_reset{terms}", ""
     sentences = [
         *([held] if held else []),

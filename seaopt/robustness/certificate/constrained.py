@@ -242,7 +242,7 @@ class _PlantRun:
         the reference of, an x_0 or a force, and asks for the force of one sample: with it there is no preview.
         """
         mpc, rig = self.mpc, self.rig
-        outer, reads = mpc.outer, () if mpc.compensation is None else mpc.compensation.reads
+        outer, reads = mpc.outer, mpc.reads
         named = (*reads, *(() if outer is None else (outer.position,)))
         moved = tuple(dict.fromkeys(name for name in named if name in rig.plant.outputs))
 

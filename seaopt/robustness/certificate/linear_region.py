@@ -6,17 +6,23 @@ every other's.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Any
 
-from seaopt.control import Controller, ControllerSpec, ForceMPC, Frontier, Law, MPCSpec, assess
+from seaopt.control import Controller, ControllerSpec, ForceMPC, Frontier, Law, LinkFeedforward, MPCSpec, assess
 from seaopt.control.frontier.rows import FrontierRow
 from seaopt.control.given.assessment import assess_row
 from seaopt.control.laws.delay import DELAY_KEYS
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.mpc.spec import MPC_BANDWIDTH_TOLERANCE, MPC_LIMITS
-from seaopt.control.tuning.tuner import RobustTo
+from seaopt.control.tuning.solution import LOWER_FRACTIONS
+from seaopt.control.tuning.tuner import RobustTo, choose_fraction, find_link
+from seaopt.errors import ControlError
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
+from seaopt.plants.friction import take_sliding
 
 
 def linear_controller(mpc: ForceMPC) -> Controller:
@@ -34,13 +40,72 @@ def linear_controller(mpc: ForceMPC) -> Controller:
     >>> controller.structure, controller.feasible
     ('custom', True)
     """
-    law = assess(_split_law(mpc), *mpc.design, linear_spec(mpc.spec))
-    return replace(law, outer=mpc.outer, compensation=mpc.compensation)
+    controller = assess(_split_law(mpc), *mpc.design, linear_spec(mpc.spec))
+    controller, link = replace(controller, outer=mpc.outer, compensation=mpc.compensation), mpc.link
+    if link is None:
+        return controller
+    stated = {field.name: getattr(link, field.name) for field in fields(LinkFeedforward)}
+    fed = replace(
+        controller,
+        law=controller.law.reading(link.feedback(mpc.sample_time_s)),
+        spec=replace(controller.spec, link_feedforward=LinkFeedforward(**stated)),
+        design=(link.see(mpc.design[0]), mpc.design[1]),
+        link=link,
+        reads=mpc.signals,
+    )
+    return replace(fed, achieved=fed.close(*mpc.design).figures())
+
+
+def feed_link_forward(
+    mpc: ForceMPC, feedforward: LinkFeedforward, plants: Mapping[str, tuple[Plant, ParameterSet]]
+) -> ForceMPC:
+    """Return predictive control that feeds a link's motion forward beside its plan.
+
+    Parameters
+    ----------
+    mpc : ForceMPC
+        Designed on a plant that holds its link.
+    feedforward : LinkFeedforward
+        Which motion is fed forward, and how.
+    plants : mapping of name to (Plant, ParameterSet)
+        What the path is made of is the first of them whose link moves. Where no fraction is stated it is as much as
+        leaves Ms on these, or leaves it as it is without, in steps of a fifth.
+
+    Raises
+    ------
+    ControlError
+        The design plant's link moves, none of the others' does, or its drive is not an inertia and a damper.
+    """
+    if mpc.design[0].moves:
+        raise ControlError(
+            f"link_feedforward: predictive control is designed on {mpc.design[0].name}, whose link moves, so that its "
+            "plan follows it already; design on a plant that holds its link, or leave link_feedforward out"
+        )
+    spec, named = replace(linear_spec(mpc.spec), link_feedforward=feedforward), dict(plants)
+    link = find_link(spec, named, mpc.per_effort)
+    assert link is not None
+    fed, pairs = replace(mpc, link=link), (mpc.design, *named.values())
+    if feedforward.fraction is not None:
+        return fed
+    link = choose_fraction(link, spec, [fed.plant(take_sliding(*pair), pair[1]) for pair in pairs])
+    allowed = spec.level("max_sensitivity") or math.inf
+    most = [max(allowed, mpc.close(*pair).figures().ms) for pair in pairs]
+    none = replace(mpc, link=replace(link, fraction=0.0))
+    lower = (replace(link, fraction=round(0.8**power * link.fraction, 3)) for power in range(LOWER_FRACTIONS + 1))
+    tried = (replace(mpc, link=each) for each in lower)
+    return next((each for each in tried if _keeps(each, pairs, most)), none)
+
+
+def _keeps(mpc: ForceMPC, pairs: Sequence[tuple[Plant, ParameterSet]], most: Sequence[float]) -> bool:
+    """Tell whether the linear region has no more than an Ms on each of some plants."""
+    return all(mpc.close(*pair).figures().ms <= allowed for pair, allowed in zip(pairs, most, strict=True))
 
 
 def _split_law(mpc: ForceMPC) -> Law:
-    """Return the law with its integrator apart: rounding leaves that pole on either side of the unit circle."""
-    law = mpc.law
+    """Return the law that reads the force alone with its integrator apart: rounding leaves that pole on either side of
+    the unit circle.
+    """
+    law = replace(mpc, link=None).law
     return Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
 
 

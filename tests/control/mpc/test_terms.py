@@ -267,7 +267,7 @@ def test_at_rest_the_sum_of_plan_and_terms_is_what_the_limit_is_of(added, needed
     mpc = plan(tmp_path, FROM_REFERENCE)
     monkeypatch.setattr(
         "seaopt.control.mpc.mpc.add_terms",
-        lambda terms, last, references, readings: (0.0, added / mpc.per_effort, last[2]),
+        lambda terms, link, last, references, readings: (0.0, added / mpc.per_effort, *last[2:]),
     )
     step = mpc.step(mpc.start, needed * mpc.static_gain, 0.0, ())
     assert step.target_N == pytest.approx(aimed * mpc.static_gain)

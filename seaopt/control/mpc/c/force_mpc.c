@@ -17,6 +17,7 @@
 #define VARIABLES FORCE_MPC_VARIABLES
 #define DELAY FORCE_MPC_DELAY
 #define PREVIEW FORCE_MPC_PREVIEW
+#define LINK_ORDER FORCE_MPC_LINK_ORDER
 #define KNOWN (PREVIEW > DELAY ? PREVIEW - DELAY : 0) /* samples of the horizon whose references differ */
 
 static int finite_number(real x) { return x - x == 0; }
@@ -32,13 +33,12 @@ real force_mpc_outer(force_mpc *s, real reference, real position) {
 }
 #endif
 
-#if FORCE_MPC_PREFILTER
-/* A reference behind its low-pass, in transposed form. */
-static real shape(real *state, real reference) {
-  real out = mpc_prefilter_num[0] * reference + state[0];
-  for (int i = 0; i < FORCE_MPC_PREFILTER; i++)
-    state[i] = mpc_prefilter_num[i + 1] * reference - mpc_prefilter_den[i + 1] * out +
-               (i + 1 < FORCE_MPC_PREFILTER ? state[i + 1] : 0);
+#if FORCE_MPC_PREFILTER || FORCE_MPC_LINK
+/* A value behind a filter, in transposed form. */
+static real shape(real *state, int order, const real *num, const real *den, real value) {
+  real out = num[0] * value + state[0];
+  for (int i = 0; i < order; i++)
+    state[i] = num[i + 1] * value - den[i + 1] * out + (i + 1 < order ? state[i + 1] : 0);
   return out;
 }
 #endif
@@ -46,7 +46,9 @@ static real shape(real *state, real reference) {
 static real clip(real x, real low, real high) { return x < low ? low : x > high ? high : x; }
 
 #if FORCE_MPC_TERMS
+#if FORCE_MPC_GRAVITY || FORCE_MPC_RIPPLE || FORCE_MPC_FRICTION
 static real limited(real x, real most) { return clip(x, -most, most); }
+#endif
 #include "terms.h"
 
 void force_mpc_terms(force_mpc *s, real reference, const real *readings) {
@@ -70,6 +72,14 @@ void force_mpc_terms(force_mpc *s, real reference, const real *readings) {
   if (s->differenced) effort += FRICTION_EFFORT * limited(FRICTION_SHARE * (now - s->before), 1);
   s->before = now;
   s->differenced = 1;
+#endif
+#if FORCE_MPC_LINK
+  real place = readings[FORCE_MPC_LINK - 1];
+  if (!s->linked_known)
+    for (int i = LINK_ORDER; i-- > 0;)
+      s->linked[i] = (LINK_NUM[i + 1] - LINK_REST * LINK_DEN[i + 1]) * place + (i + 1 < LINK_ORDER ? s->linked[i + 1] : 0);
+  s->linked_known = 1;
+  effort -= shape(s->linked, LINK_ORDER, LINK_NUM, LINK_DEN, place);
 #endif
   s->added = mpc_per_effort * effort;
 }
@@ -250,7 +260,7 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
     if (i == 0) s->reference = last;
     real asked = last + weight;
 #if FORCE_MPC_PREFILTER
-    asked = shape(shaped, asked);
+    asked = shape(shaped, FORCE_MPC_PREFILTER, mpc_prefilter_num, mpc_prefilter_den, asked);
     if (i == 0) memcpy(s->shaped, shaped, sizeof shaped);
 #endif
     rest = clip(asked / mpc_static_gain - drift, least, most);

@@ -31,6 +31,10 @@ typedef struct {
   force_mpc_real weight, added;   /* to the references, to the command */
   force_mpc_real before;          /* what was differenced last */
   int differenced;                /* whether there was one */
+#if FORCE_MPC_LINK
+  force_mpc_real linked[FORCE_MPC_LINK_ORDER]; /* what the filters of the link's motion keep */
+  int linked_known;
+#endif
 #endif
 #if FORCE_MPC_PREFILTER
   force_mpc_real shaped[FORCE_MPC_PREFILTER]; /* what the low-pass of the reference keeps */
@@ -63,7 +67,7 @@ force_mpc_real force_mpc_outer(force_mpc *s, force_mpc_real reference, force_mpc
 #endif
 
 #if FORCE_MPC_TERMS
-/* Once a sample, before force_mpc_step: what is compensated, by the reference (with an outer loop what that returned) and
+/* Once a sample, before force_mpc_step: what is compensated and fed forward of the link's motion, by the reference (with an outer loop what that returned) and
  * FORCE_MPC_READINGS readings, FORCE_MPC_READ in this order, taken in the same sample as the measurement. The step adds the
  * weight to all of its references and the rest to its command, within limits. Where one is no number all stays as it was. */
 void force_mpc_terms(force_mpc *s, force_mpc_real reference, const force_mpc_real *readings);

@@ -6,6 +6,7 @@ from seaopt.control import ForceMPC
 from seaopt.control.laws.verdict import join_labels
 from seaopt.formatting import format_count, format_number
 from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met, show_limit
+from seaopt.units import unit_after
 
 
 def judge(mpc: ForceMPC, commands: Commands) -> Verdict:
@@ -23,6 +24,8 @@ def judge(mpc: ForceMPC, commands: Commands) -> Verdict:
 def describe(mpc: ForceMPC) -> list[Section]:
     """Return the limits of the plan, the loop's limits with what was achieved, and the findings."""
     spec, unit = mpc.spec, mpc.design[0].outputs[mpc.spec.measured]
+    slew, per_second = spec.current_slew_A_per_s, f"{unit_after(mpc.actuation.unit) or ' 1'}/s"
+    limits = mpc.actuation.show(mpc.command_limit) + ("" if slew is None else f", {slew:g}{per_second}")
     bounds = [
         f"{name} within {low:g} and {high:g} {mpc.kalman.units[mpc.kalman.names.index(name)]}".rstrip()
         for name, (low, high) in spec.bounds.items()
@@ -47,8 +50,8 @@ def describe(mpc: ForceMPC) -> list[Section]:
             aside=f"{spec.measured} of {mpc.design[0].name} at {spec.sample_rate_hz:g} Hz, {mpc.delays}",
             part="mpc",
             sentences=(
-                f"Plans within {mpc.describe_limits()}, enough to hold {mpc.static_gain * mpc.command_limit:.4g} {unit}"
-                f"; horizon {1e3 * spec.horizon_s:g} ms, {mpc.prediction.knots.size} moves.",
+                f"Plans within {limits}, enough to hold {mpc.static_gain * mpc.command_limit:.4g} {unit}; horizon "
+                f"{1e3 * spec.horizon_s:g} ms, {mpc.prediction.knots.size} moves.",
                 *bounds,
             ),
             tables=(table,),
