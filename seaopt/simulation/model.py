@@ -222,6 +222,7 @@ def fill_parameters(model: Model, p: Any) -> Any:
     return ca.vertcat(*(values.get(name, ca.SX(0)) for name in model.plant.parameters))
 
 
+@memo
 def depends_on_time(model: Model) -> bool:
     """Tell whether f or h depends on the time itself."""
     return bool(ca.depends_on(ca.vertcat(model.f, model.h), model.t))
