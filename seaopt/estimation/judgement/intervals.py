@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.estimation.judgement.second_log import FAR, SECOND, find_excess, has_two_amplitudes
+from seaopt.estimation.problem.chance import exceeds
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import solve_seen
@@ -152,8 +153,6 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
     stated = {e.name for e in problem.experiments if e.data.initial_state != "estimate"}
     if not stated or fit.status != "converged":
         return
-    from scipy.special import chdtri  # deferred: 0.1 s
-
     freed, at, states = _free_starts(minimum, stated)
     first = freed.evaluate(at)
     if not np.all(np.isfinite(first.hessian)):
@@ -171,9 +170,10 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
             continue
         before, after = fitted[name].rms, best.power[name].rms
         falls = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
-        enough = 0.5 * float(chdtri(states[name], CHANCE)) * colour  # each state that is freed takes some away
+        # Each state that is freed takes some away.
+        by_chance = exceeds(0.5 * states[name], float(fitted[name].counts @ falls) / colour)
         # Of simulated logs without noise the residual is rounding, and the integration's error.
-        if float(fitted[name].counts @ falls) < enough or np.max(before * sizes) < FAINT:
+        if by_chance > CHANCE or np.max(before * sizes) < FAINT:
             continue
         gone = 1.0 - math.exp(-2.0 * float(np.max(falls)))
         most = max(beyond, key=lambda n: beyond[n] / max(abs(values[n]), 1e-300), default="")
