@@ -33,6 +33,7 @@ from seaopt.machine.response.tripped import Trip, find_refused, find_trip
 from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand, stands_still
 from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference, take_ticks
+from seaopt.machine.wording import say_position_stays
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import Result, Worded, record
@@ -118,11 +119,13 @@ class Acceptance(Result, Worded):
     @property
     def met(self) -> bool:
         """Whether every log was made by this law, each limit of the loop is confirmed, and the machine is one of those
-        that were certified, or, where nothing is known of a certificate, within the uncertainty that was given.
+        that were certified, or, where nothing is known of a certificate, within the uncertainty that was given; no
+        link's position may have stayed under a closed outer loop.
         """
         judged = self.response is not None and self.response.met
-        certified = self.certificate in ("met", None)
-        return self.replayed and judged and certified and (self.differences is None or self.differences.inside)
+        certified = self.certificate in ("met", None) and (self.differences is None or self.differences.inside)
+        followed = all(row.position_stays is None for row in self.replays)
+        return self.replayed and judged and certified and followed
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of acceptance.json (schema seaopt/acceptance/1)."""
@@ -263,7 +266,8 @@ def accept(
                 tried.append((before, replay(controller, before, others)))
         chosen, row = max(tried, key=lambda pair: (pair[1].met, pair[1].explained, pair[1].undecided))
         unit_missing = bool(unclear) and not row.met and not row.explained
-        row = replace(row, unit_missing=unit_missing, begins=chosen.begins)
+        stays = chosen.position_stays
+        row = replace(row, unit_missing=unit_missing, begins=chosen.begins, position_stays=stays)
         if chosen.gaps is not None and chosen.rendered is None and row.met and row.ticks_per_row == 1:
             (whole,) = list_ticks(controller, [log], reference, at, whole=True)
             row = replay_stretches(controller, row, chosen, whole, others or {})
@@ -280,7 +284,10 @@ def accept(
     experiments = tuple(
         (plant, replace(make_experiment(law, plant, ticks, row.command_late), law=_hash(controller)))
         for ticks, row in zip(map(_end_at_trip, rows, (row.trip for row in replays)), replays, strict=True)
-        if row.met and _has_commands(ticks, row) and (plant := _find_plant(law, ticks, link)) is not None
+        if row.met
+        and row.position_stays is None
+        and _has_commands(ticks, row)
+        and (plant := _find_plant(law, ticks, link)) is not None
     )
     result = Acceptance(
         controller=law,
@@ -309,6 +316,8 @@ def accept(
     planned = played if apart is None or played is None else played.outer
     for ticks, row in zip(rows, replays, strict=True):
         try:
+            if row.position_stays is not None:
+                raise LogError(say_position_stays(result.controller, row.position_stays))
             if ticks.rendered is not None:
                 raise LogError(OUTER_LOOP if around else WITH_OTHERS)
             if len(ticks) < FEWEST:

@@ -52,6 +52,7 @@ class Replay(Result):
     trip: Trip | None = None  # of the law's gate: what comes after it is no longer of the law
     offset: Offset | None = None  # of the reference that the law was given, within half of the step it is logged in
     begins: int = 0  # as in `Ticks`: rows at the start that are left out
+    position_stays: float | None = None  # as in `Ticks`: nothing is judged of the outer loop then
     unit_missing: bool = False  # of the reference, which may be the law's own or that of its outer loop
 
     @property

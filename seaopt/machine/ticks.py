@@ -119,6 +119,16 @@ class Ticks:
         return None if self.place is None else float(np.nanmedian(self.place))
 
     @property
+    def position_stays(self) -> float | None:
+        """Where the link's position stays while what its outer loop is given moves; None where none ran, or it moves,
+        too.
+        """
+        if self.given is None:
+            return None
+        given, position = (part[np.isfinite(part)] for part in self.given.T)
+        return float(position[0]) if np.ptp(given) > 0.0 and not np.ptp(position) else None
+
+    @property
     def quantum(self) -> float:
         """The step of the logged command; 0 where none is seen."""
         return find_quantisation(self.command)

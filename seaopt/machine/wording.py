@@ -133,6 +133,18 @@ def say_trip(controller: Controller, trip: Trip) -> str:
     )
 
 
+def say_position_stays(controller: Controller, value: float) -> str:
+    """Return that a link's position stays while the outer loop is closed, and what to do about it."""
+    outer = controller.outer
+    assert outer is not None
+    at = f"{format_number(value)}{unit_after(outer.place_unit)}"
+    return (
+        f"{outer.position} stays at {at} with the outer loop closed, while what that is given moves: its encoder is "
+        "dead or not read, or the link was held, so that nothing is judged of the outer loop; move the link by hand "
+        f"with the drive off, close the outer loop only where {outer.position} follows, and record again"
+    )
+
+
 def say_status(reported: Reported, row: Replay) -> str:
     """Return what the machine's own status says of a law that was stopped; nothing where it was not, by both."""
     fault = "" if reported.fault_s is None else f"its status is a fault from {reported.fault_s:.3f} s on"

@@ -25,9 +25,10 @@ T = 1e-3
 INERTIA, DAMPER = 0.5, 2.0  # of the link
 
 
-def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1, dry=0.0):
+def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1, dry=0.0, stays=None):
     """Return x_0, or the force asked for where the law has no stiffness, then the force reference, the torque, the
-    link's angle, and the command, a row per tick. `dry` is friction at the motor, N m, smoothed over 1 rad/s.
+    link's angle, and the command, a row per tick. `dry` is friction at the motor, N m, smoothed over 1 rad/s; `stays`:
+    where a dead encoder says that the link is.
     """
     rng, outer = np.random.default_rng(seed), law.outer
     mass, kick = KNEE["N"] ** 2 * KNEE["J_m"], KNEE["N"] * KNEE["eta"] * KNEE["K_tau"]
@@ -43,7 +44,7 @@ def run(law, goal, *, stiffness=20.0, damping=1.0, late=0, seed=1, dry=0.0):
     rows = np.empty((goal.size, 5))
     places = [0.0] * (late + 1)
     for k in range(goal.size):
-        angle = x[2] + 1e-5 * rng.normal()
+        angle = x[2] + 1e-5 * rng.normal() if stays is None else stays
         torque = KNEE["k_s"] * (x[0] - x[2]) + 0.02 * rng.normal()
         places.append(angle)
         seen = places[-1 - late]
@@ -158,6 +159,20 @@ def test_the_page_of_a_bring_up_says_what_to_log(law, words, request):
     plants = {"stand": law.design[0], "knee": so.plants.rotary()}
     plan = so.bring_up(law, plants, law.design[1], samples=2, fractions=(), limits={"tau_s": 40.0})
     assert words in " ".join(repr(plan).split())
+
+
+@pytest.mark.parametrize("others", [False, True])
+def test_a_position_that_stays_with_the_outer_loop_closed_is_said_and_judges_nothing(impedance, others):
+    """The encoder is dead: the law makes the logged command of what it read, and nothing holds the link to x_0."""
+    log = replace(make_log(run(impedance, excite(20.0, 3), stays=0.02)), source="dead")
+    right = [make_log(run(impedance, excite(20.0, 3)))] if others else []
+    result = so.accept(impedance, [*right, log], link=take_link())
+    row = result.replays[-1]
+    assert row.met and row.position_stays == 0.02 and not result.met, result
+    assert (result.response is not None) == others and len(result.experiments) == len(right)
+    assert result.to_dict()["replay"]["logs"][-1]["position_stays"] == 0.02
+    words = "theta_l stays at 0.02 rad with the outer loop closed"
+    assert " ".join(str(result).split()).count(words) == 1 and words in result.left_out["dead"], result
 
 
 def take_link():

@@ -10,6 +10,7 @@ import pytest
 
 import seaopt as so
 from seaopt.machine.differences.size_fit import Difference
+from seaopt.machine.page.page import describe
 from seaopt.machine.page.verdict import judge
 from seaopt.machine.wording import say_difference
 from seaopt.reporting.sections.data import Commands
@@ -67,14 +68,14 @@ def test_a_stuck_bandwidth_is_said_beside_what_was_asked(judged, value, says, li
 @pytest.mark.parametrize(
     ("name", "says", "never"),
     [
-        ("f_c", "record a larger amplitude, beside which dry friction is less", "1382"),
-        ("k", "record 1382 periods", "is less"),
+        ("f_c", "record a larger amplitude, beside which dry friction is less", "138"),
+        ("k", "record 138 periods", "is less"),
     ],
 )
 def test_no_periods_are_asked_for_where_friction_is_what_differs(judged, name, says, never):
     _, result = judged
     rows = [
-        replace(row, outcome="undecided", periods=1382) if row.name == "bandwidth" else row
+        replace(row, outcome="undecided", periods=138) if row.name == "bandwidth" else row
         for row in result.response.judged
     ]
     made = {"kind": "parameter", "unit": "-", "explains": 1.0, "low": 1.9, "high": 2.1, "value": 2.0}
@@ -83,6 +84,24 @@ def test_no_periods_are_asked_for_where_friction_is_what_differs(judged, name, s
     first, reason = (each.what for each in judge(other, Commands()).reasons)
     assert first == f"{name} is 2 times its value"
     assert f"bandwidth: {says}" in reason and never not in reason
+
+
+def read_row(result, name):
+    """Return the cells of a figure's row in the printed table."""
+    (table,) = next(each for each in describe(result) if each.part == "response").tables
+    return dict(zip(table.head, next(row for row in table.rows if row[0] == name), strict=True))
+
+
+def test_a_number_of_periods_that_nobody_records_is_a_larger_amplitude_in_the_table(judged):
+    _, result = judged
+    for periods, cell in ((21, "21 periods"), (1449, "a larger amplitude at 22 Hz")):
+        rows = [
+            replace(row, outcome="undecided", periods=periods, where_hz=22.0) if row.name == "Ms" else row
+            for row in result.response.judged
+        ]
+        other = replace(result, response=replace(result.response, judged=tuple(rows)))
+        assert read_row(other, "Ms")["would decide"] == cell
+        assert {row["periods"] for row in other.to_dict()["response"]["figures"] if row["name"] == "Ms"} == {periods}
 
 
 def test_a_factor_at_the_end_of_what_is_tried_is_said_to_be_that_or_more():

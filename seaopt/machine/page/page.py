@@ -14,12 +14,21 @@ from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.comparison import TOLERATED
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.page.figures import list_panels
-from seaopt.machine.page.verdict import OUTCOMES, judge, name_figure, say_inside, say_undecided, show_interval
+from seaopt.machine.page.verdict import (
+    OUTCOMES,
+    judge,
+    list_left_out,
+    name_figure,
+    say_inside,
+    say_needed,
+    say_undecided,
+    show_interval,
+)
 from seaopt.machine.reference_offset import Offset
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.measured_margins import MARGINS
 from seaopt.machine.response.periods import say_left_out
-from seaopt.machine.response.verdicts import HOUR, SHORT_BY, Judged, Measured, Response, compares_amplitudes
+from seaopt.machine.response.verdicts import LONGEST, SHORT_BY, Judged, Measured, Response, compares_amplitudes
 from seaopt.machine.ticks import AT_LIMIT, Gaps
 from seaopt.machine.wording import say_bias, say_cause, say_difference, say_status, say_trip
 from seaopt.reporting.page.chart import make_chart
@@ -37,6 +46,7 @@ from seaopt.reporting.sections.data import (
 from seaopt.reporting.sections.kinds.controller import explain_sliding, say_bandwidths, show_stuck_bandwidth
 from seaopt.units import unit_after
 
+NEEDED = "would decide"  # heads a column
 PARTS = {
     "replay": "Is it this law",
     "causes": "Why the command differs",
@@ -155,7 +165,7 @@ def _say_no_margin(row: Judged, response: Response) -> str:
     """Return that a margin is not told, and what would tell it."""
     larger = f"larger reference near {format_number(row.where_hz, 3)} Hz"
     lasts = math.inf if row.periods is None else row.periods * response.period_s
-    if lasts > HOUR:
+    if lasts > LONGEST:
         return NO_MARGIN.format(row.name, f"A {larger}")
     return NO_MARGIN.format(row.name, f"{row.periods} periods in all ({format_number(lasts, 3)} s) or a {larger}")
 
@@ -184,11 +194,11 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
             "" if row.name == "stability" else show_interval(row),
             format_number(row.predicted, 3),
             format_number(row.where_hz, 3),
-            "" if row.periods is None else str(row.periods),
+            say_needed(result, row),
         )
         for row in response.judged
     )
-    head = ("figure", "verdict", "limit", "measured", "interval", "predicted", "at (Hz)", "periods needed")
+    head = ("figure", "verdict", "limit", "measured", "interval", "predicted", "at (Hz)", NEEDED)
     aside = ", ".join(_say_extent(part) for part in response.measured)
     remarks = [
         f"Each statement holds with a probability of {100.0 * response.confidence:g} %. Limits are those of the "
@@ -221,9 +231,9 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
         remarks.append(
             f"Undecided is no doubt about the machine: the log does not decide {say_undecided(result, response)}."
         )
-    remarks += [f"Left out: {text}" for text in result.left_out.values()]
+    remarks += [f"Left out: {text}" for text in list_left_out(result)]
     items = tuple(_warn_left_out(part) for part in response.measured if part.left_out.total)
-    tables = (Table(head=head, rows=rows, align="<<>>>>>>", optional=("periods needed",)),)
+    tables = (Table(head=head, rows=rows, align="<<>>>>>>", optional=(NEEDED,)),)
     return Section(title="Response", part="response", aside=aside, tables=tables, remarks=tuple(remarks), items=items)
 
 

@@ -8,8 +8,15 @@ from seaopt.machine.causes import Cause
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.comparison import TOLERATED
 from seaopt.machine.replay import Replay
-from seaopt.machine.response.verdicts import LEAST_PHASES, Judged, Response
-from seaopt.machine.wording import say_cause, say_difference, say_missing, say_status, say_trip
+from seaopt.machine.response.verdicts import LEAST_PHASES, LONGEST, Judged, Response
+from seaopt.machine.wording import (
+    say_cause,
+    say_difference,
+    say_missing,
+    say_position_stays,
+    say_status,
+    say_trip,
+)
 from seaopt.plants.friction import list_friction_parameters
 from seaopt.reporting.sections.data import Commands, Reason, Step, Style, Verdict
 from seaopt.units import unit_after
@@ -41,6 +48,12 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     reasons = [Reason(what=_say_mismatch(row, result), where=source) for source, row in off]
     trips = zip(result.sources, result.replays, strict=True)
     reasons += [Reason(what=say_trip(result.controller, row.trip), where=source) for source, row in trips if row.trip]
+    stays = zip(result.sources, result.replays, strict=True)
+    reasons += [
+        Reason(what=say_position_stays(result.controller, row.position_stays), where=source)
+        for source, row in stays
+        if row.position_stays is not None
+    ]
     count = format_count(len(result.sources), "log")
     parts = [f"the law makes the logged command in {len(result.sources) - len(off)} of {count}"]
     reported = zip(result.sources, result.reported, result.replays, strict=True)
@@ -68,10 +81,17 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
         parts.append("the law is not certified")
         reasons.append(Reason(what=UNCERTIFIED[result.certificate], where=", ".join(result.broken)))
     if response is None and result.replayed:
-        reasons += [Reason(what=f"no response: {text}") for text in result.left_out.values()]
+        reasons += [Reason(what=f"no response: {text}") for text in list_left_out(result)]
     missing = result.certificate == "missing" and commands.certify
     steps = (Step(text="certify the law:", copied=(commands.certify,)),) if missing else ()
     return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons), next=steps)
+
+
+def list_left_out(result: Acceptance) -> list[str]:
+    """Return why there is no response of some logs, but for those of which the verdict says more."""
+    pairs = zip(result.sources, result.replays, strict=True)
+    stay = {source for source, row in pairs if row.position_stays is not None}
+    return [text for source, text in result.left_out.items() if source not in stay]
 
 
 def say_inside(result: Acceptance, differences: Differences) -> str:
@@ -104,8 +124,7 @@ def _say_refuted(row: Judged) -> str:
     if row.name == "stability":
         return "stability is refuted"
     limit = f"{name_figure(row)} {row.sense} {format_number(row.limit)}{unit_after(row.unit)} is refuted"
-    at = "" if row.where_hz is None else f" at {format_number(row.where_hz, 3)} Hz"
-    return f"{limit}: {format_number(row.value, 3)} ({show_interval(row)}){at}"
+    return f"{limit}: {format_number(row.value, 3)} ({show_interval(row)}){_say_where(row)}"
 
 
 def say_undecided(result: Acceptance, response: Response) -> str:
@@ -152,9 +171,23 @@ def _say_near(row: Judged) -> str:
     unit, value, near = unit_after(row.unit), format_number(row.value, 4), format_number(100.0 * (row.near or 0.0), 2)
     return (
         f"{name_figure(row)}: the estimate, {value}{unit}, is within {near} % of the limit as judged, "
-        f"{format_number(row.limit, 4)}{unit}, so that no record of sensible length decides (over an "
-        "hour); play a larger reference, or ask for less or tune for more of it"
+        f"{format_number(row.limit, 4)}{unit}, so that no record of sensible length decides (over ten "
+        f"minutes); play a larger reference{_say_where(row)}, or ask for less or tune for more of it"
     )
+
+
+def _say_where(row: Judged) -> str:
+    return "" if row.where_hz is None else f" at {format_number(row.where_hz, 3)} Hz"
+
+
+def say_needed(result: Acceptance, row: Judged) -> str:
+    """Return what would decide a figure, or tell a margin, in a cell: periods, where they can be recorded."""
+    assert result.response is not None
+    if row.periods is None:
+        return ""
+    if row.periods * result.response.period_s > LONGEST or (row.limit is not None and _rubs(result)):
+        return f"a larger amplitude{_say_where(row)}"
+    return format_count(row.periods, "period")
 
 
 def show_interval(row: Judged) -> str:

@@ -33,7 +33,9 @@ class Judged:
     # Of the machine whose limit and prediction these are, by dry friction: "stuck", or "as played", which is that of
     # the certified machines under the reference that was played.
     state: str = ""
-    near: float | None = None  # where those periods last over an hour: the estimate's distance from the limit, relative
+    near: float | None = (
+        None  # the estimate's distance from the limit, relative, where those periods last over ten minutes
+    )
 
     @property
     def told(self) -> bool:

@@ -58,7 +58,7 @@ SHORT_BY = 0.1  # of the bandwidth
 CENTRE = 1.0 - 1e-9  # a risk at which discs are points
 MOST_PERIODS = 1e6  # that are counted
 TRACKING = ("reference peak", "bandwidth")
-HOUR = 3600.0  # s: a record that is longer is not asked for
+LONGEST = 600.0  # s: a record that is longer is not asked for
 
 
 class AgainstFriction:
@@ -294,8 +294,8 @@ def _leave_open(row: Judged) -> Judged:
 
 
 def _tell_near(row: Judged, period_s: float) -> Judged:
-    """Return a row with how near its estimate is to the limit, where it is so near that no hour would decide."""
-    if row.periods is None or row.periods * period_s <= HOUR or row.value is None or not row.limit:
+    """Return a row with how near its estimate is to the limit, where no record of sensible length would decide."""
+    if row.periods is None or row.periods * period_s <= LONGEST or row.value is None or not row.limit:
         return row
     return replace(row, near=abs(row.value / row.limit - 1.0))
 
