@@ -30,7 +30,7 @@ from seaopt.machine.response.enclosed import enclose_outer, enclose_ticks
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
 from seaopt.machine.response.reported import Reported, read_status
 from seaopt.machine.response.tripped import Trip, find_refused, find_trip
-from seaopt.machine.response.verdicts import Response, has_dry_friction, judge_response
+from seaopt.machine.response.verdicts import Response, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand, stands_still
 from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference, take_ticks
 from seaopt.machine.wording import say_position_stays
@@ -42,10 +42,6 @@ from seaopt.units import unit_after
 
 DRAWS, SEED = 200, 1
 EXPLAINED = 0.95  # of the difference, from which on another rate is what the figures are stated at
-FEWER_TICKS = (
-    "a machine with dry friction is compared with its model by simulation under the reference of every tick, which a "
-    "log of every n-th has not"
-)
 OUTER_LOOP = (
     "an outer loop was closed around the law, so that the link and what touches it are in the response; give the plant "
     "of the link (link), or leave the outer loop out, with the link as in the design plant"
@@ -335,9 +331,6 @@ def accept(
         return replace(result, left_out=left_out, stepped=stepped, experiments=kept)
     response = judge(law, join_blocks(blocks), confidence)
     whole = [ticks for ticks in rows if ticks.source not in left_out]
-    if has_dry_friction(law) and any(row.ticks_per_row > 1 for row in replays):
-        left_out["differences"] = FEWER_TICKS
-        return replace(result, response=response, left_out=left_out)
     draws = list_draws(law, uncertainty, ranges, DRAWS, SEED)
     differences = compare(law, response.measured, whole, draws, confidence, apart)
     if differences is not None and differences.prediction is not None:

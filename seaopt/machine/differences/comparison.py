@@ -20,11 +20,12 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller, sample
 from seaopt.control.loops.sampled_plant import DELAY
 from seaopt.errors import LogError
+from seaopt.machine.decimated import count_ticks_per_row
 from seaopt.machine.design_run import RTOL, run_design
 from seaopt.machine.differences.few_periods import find_most_noise, find_widening
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.judged import Measured
-from seaopt.machine.response.periods import Blocks, cut_periods, join_blocks
+from seaopt.machine.response.periods import Blocks, cut_periods, find_again, find_period, join_blocks
 from seaopt.machine.response.verdicts import has_dry_friction
 from seaopt.machine.ticks import Ticks
 from seaopt.parameters import ParameterSet
@@ -132,12 +133,14 @@ class Comparison:
         """Return the outputs of runs under a share of a log's reference, with the noise of its readings where that
         shakes the motor.
         """
-        reference, shaking = share * ticks.reference, self._find_shaking(ticks)
+        every, shaking = count_ticks_per_row(self.controller, ticks), self._find_shaking(ticks)
+        reference = share * _fill_ticks(ticks, every)
         if shaking is None:
-            return run_design(source, sets, reference, rate=self.rate).outputs
+            alone = run_design(source, sets, reference, rate=self.rate).outputs
+            return {name: rows[:, ::every] for name, rows in alone.items()}
         gains = np.repeat([1.0, -1.0], len(sets))
         both = run_design(source, [*sets, *sets], reference, sensors=shaking, noise_gain=gains, rate=self.rate)
-        return {name: rows.reshape(2, len(sets), -1).mean(axis=0) for name, rows in both.outputs.items()}
+        return {name: rows.reshape(2, len(sets), -1).mean(axis=0)[:, ::every] for name, rows in both.outputs.items()}
 
     def _find_shaking(self, ticks: Ticks) -> Sensors | None:
         """Return the noise of a log's readings where it shakes the motor through dry friction."""
@@ -184,9 +187,25 @@ def _shift_early(values: ParameterSet, period_s: float) -> tuple[int, ParameterS
     return ticks, values.with_parameters(*left)
 
 
+def _fill_ticks(ticks: Ticks, every: int) -> Float[np.ndarray, " n"]:
+    """Return the reference of each tick of a law, of rows that have every n-th of whole periods: its lines lie below
+    half of their rate.
+    """
+    if every == 1:
+        return ticks.reference
+    period = find_period(ticks.reference)
+    assert period is not None
+    spectra = np.fft.rfft(ticks.reference.reshape(-1, period), axis=1)
+    return every * np.fft.irfft(spectra, every * period, axis=1).ravel()
+
+
 def _measure_noise(ticks: Ticks) -> Float[np.ndarray, " y"]:
-    """Return the std of the noise of each signal that is read, taken as white."""
-    return np.array([measure_white(reading[np.isfinite(reading)]) for reading in ticks.measured.T])
+    """Return the std of the noise of each signal that is read, taken as white, by what differs from one period of the
+    reference to the next that is like it.
+    """
+    again, period = find_again(ticks.reference)
+    apart = (ticks.measured[period:] - ticks.measured[:-period])[again] / math.sqrt(2.0)
+    return np.array([measure_white(reading[np.isfinite(reading)]) for reading in apart.T])
 
 
 def _find_share(controller: Controller, ticks: Ticks, noise: Float[np.ndarray, " y"]) -> float:

@@ -137,6 +137,16 @@ def _find_period(content: bytes) -> int | None:
     return None
 
 
+def find_again(reference: Float[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " k"], int]:
+    """Return which rows of a reference come again after its period, and that; none, after all of them, where it has no
+    period.
+    """
+    period = find_period(reference)
+    if period is None:
+        return np.zeros(0, dtype=bool), reference.size
+    return _find_repeated(reference, period, _span(reference)), period
+
+
 def _find_repeated(reference: Float[np.ndarray, " n"], lag: int, size: float) -> Bool[np.ndarray, " k"]:
     """Tell which rows come again after a lag."""
     return np.abs(reference[lag:] - reference[:-lag]) <= SAME * size

@@ -1,0 +1,57 @@
+"""Logs of every n-th tick of a machine with dry friction, compared with its model as those of every tick are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.machine.bringup.excitation import design_excitation
+from tests.machine.simulator import Bench, Machine
+
+FRICTION = 40.0
+RIGHT = replace(Machine(), coulomb=FRICTION, smoothing=5e-3)
+
+
+@pytest.fixture(scope="module")
+def dry(compiler, tmp_path_factory):
+    """Return the bench of a law for a plant with dry friction, and its reference of six sets of phases."""
+    values = so.plants.thor().update(f_c=FRICTION, v_s=5e-3)
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0)
+    law = so.tune(so.plants.high_impedance(), values, spec)
+    played = design_excitation(law, share=0.5, bias=0.0, phases=6, periods=8, limits={"F1": 600.0}, seed=1)
+    return Bench(compiler, tmp_path_factory.mktemp("dry"), law), played.reference
+
+
+def keep_every(log, every, first=0):
+    columns = {name: log[name][first::every] for name in ("reference", "F1", "I")}
+    return so.Log.from_arrays(time=log.time[first::every], source="bench", **columns)
+
+
+@pytest.mark.parametrize(("every", "first"), [(2, 0), (2, 1)])
+def test_a_right_machine_is_one_of_those_that_were_certified(dry, every, first):
+    """And its figures are as played, as in a log of every tick: it was met with nothing compared at all."""
+    bench, reference = dry
+    log = bench.log(RIGHT, reference, noise=0.5)
+    whole, part = (so.accept(bench.controller, [each]) for each in (log, keep_every(log, every, first)))
+    assert part.replayed and part.replays[0].ticks_per_row == every
+    assert part.differences is not None and part.differences.inside and part.differences.misfit < 2.0, part
+    assert "differences" not in part.left_out
+    for row, other in zip(whole.response.judged, part.response.judged, strict=True):
+        assert (row.name, row.state) == (other.name, other.state)
+        if row.predicted is not None:
+            assert other.predicted == pytest.approx(row.predicted, rel=0.02), (row, other)
+    assert whole.met == part.met
+
+
+def test_friction_that_is_doubled_is_named(dry):
+    bench, reference = dry
+    log = bench.log(replace(RIGHT, coulomb=2.0 * FRICTION), reference, noise=0.5)
+    result = so.accept(bench.controller, [keep_every(log, 2)])
+    first = result.differences.found[0]
+    assert result.replayed and not result.met and "f_c" in (first.name, *first.alike), result
+    assert np.isclose(
+        dict(zip((first.name, *first.alike), (first.value, *first.alike_values), strict=True))["f_c"], 2.0, rtol=0.1
+    )
