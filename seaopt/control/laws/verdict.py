@@ -92,7 +92,8 @@ class PossibleBandwidths:
             return f"no bandwidth that meets all limits was found; {closest}"
         nearest = " and ".join(f"{f:.4g} Hz" for f in self.nearest_hz)
         most = "" if self.largest_hz in self.nearest_hz else f", {self.largest_hz:.4g} Hz at most"
-        return f"with these limits {nearest} {'is' if len(self.nearest_hz) == 1 else 'are'} possible{most}"
+        verb = "is" if len(self.nearest_hz) == 1 else "are"
+        return f"with these limits {nearest} {verb} possible{most} (tuned, not certified)"
 
 
 def judge(spec: LoopSpec, loop: MeasuredLoop, scope: Scope, *, stuck: bool = False) -> list[LimitVerdict]:

@@ -253,7 +253,7 @@ class ForceMPC(ReadsLink, Result, Worded):
         loop = next(iter(self.loops.values()))
         blocked = shorten_blocked(explain_broken(self.spec, self.verdicts, self.measured_loops[0], loop))
         remedy = (
-            f"{self.possible_hz:.4g} Hz is possible"
+            f"{self.possible_hz:.4g} Hz is possible (tuned, not certified)"
             if self.possible_hz is not None
             else "no lower bandwidth is known that keeps them; shorten the delay, sample faster, give the plan more "
             "moves, or raise a limit"

@@ -58,6 +58,7 @@ def test_neighbours_of_an_impossible_bandwidth_are_named(bench):
     possible = controller.possible
     assert possible.nearest_hz and possible.largest_hz == controller.largest_bandwidth_hz >= max(possible.nearest_hz)
     assert f"{possible.nearest_hz[0]:.4g} Hz" in controller.explanation
+    assert "possible" in controller.explanation and controller.explanation.endswith("(tuned, not certified)")
     for f in possible.nearest_hz:
         assert so.tune(stand, params, replace(spec, bandwidth_hz=f)).feasible
 
