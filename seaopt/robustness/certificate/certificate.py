@@ -180,6 +180,14 @@ class Certificate(Result, Worded):
         return all(row.met for row in self.requirements)
 
     @property
+    def unchecked(self) -> dict[str, str]:
+        """What applies, requires nothing, and could not be checked, with the reason; of a schedule at one of its places
+        at least.
+        """
+        parts = (each.simulated for each in (self, *self.places))
+        return {what: part.left_out[what] for part in parts if part is not None for what in part.unchecked}
+
+    @property
     def fails_by_weight(self) -> bool:
         """Whether what is compensated of a weight fails, which no tuning mends: its loops are without it."""
         broken = {row.name for row in self.requirements if not row.met}
@@ -338,6 +346,7 @@ class Certificate(Result, Worded):
                 "monte_carlo": to_content(self.monte_carlo),
                 "passivity": None,
                 "simulation": None,
+                "unchecked": self.unchecked,
                 "remarks": list(self.remarks),
                 "notes": list(self.notes),
                 "schedule": {
@@ -371,6 +380,7 @@ class Certificate(Result, Worded):
             "compensation": list_compensation(self.compensation, self.compensation_draws),
             "monte_carlo": to_content(self.monte_carlo),
             "varied": to_content(self.varied),
+            "unchecked": self.unchecked,
             "remarks": list(self.remarks),
             "notes": list(self.notes),
             "impedance": None if self.impedance is None else self.impedance.to_dict(),

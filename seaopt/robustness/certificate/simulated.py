@@ -41,6 +41,9 @@ Played = TypeVar("Played")
 SIMULATION_FAILURES = "simulation_failures"
 STEP_SECONDS, SECONDS = 1.0, 3.5  # that steps, and all scenarios, of a plant take as a rule
 SWEEP, SCENARIOS, PORT = 1.5, 2.0, 0.7  # of the time of simulations: of each plant, and of the design plant's port
+NOTHING_LARGE = (
+    "large signals"  # of all plants, where no command is limited and nothing rubs: they look like small ones
+)
 STEP_OVERSHOOT, STEP_SETTLING = "step_overshoot", "step_settling_s"
 # Kinds of fault that have a figure of their own are requirements by these names; all others are counted.
 NAMED_FAULTS = {
@@ -62,6 +65,8 @@ class Simulated(Result, Worded):
     passivity, environments : Passivity and StabilityMap, or None
         None for a plant without a port at link 2.
     left_out : mapping of what to reason
+    unchecked : tuple of str
+        Of `left_out`, what applies and could not be made.
     sensors, command_step, seed
         What the scenarios were played with.
     """
@@ -74,6 +79,7 @@ class Simulated(Result, Worded):
     sensors: Sensors
     command_step: float
     seed: int
+    unchecked: tuple[str, ...] = ()
 
     @property
     def met(self) -> bool:
@@ -83,7 +89,7 @@ class Simulated(Result, Worded):
     def simulation_dict(self) -> dict[str, Any]:
         """Return what goes into robustness.json under "simulation"."""
         played = {} if self.verification is None else self.verification.to_dict()
-        names = ("large_signal", "sensors", "command_step", "seed", "left_out")
+        names = ("large_signal", "sensors", "command_step", "seed", "left_out", "unchecked")
         parts = {name: to_content(getattr(self, name)) for name in names}
         return {"met": self.met, "passed": self.met} | played | parts
 
@@ -244,12 +250,15 @@ def run_simulations(
         done[what] = next(attempts)
     play = partial(verify, controller, plants, parameters, draws=draws, known=steps, executor=executor, **devices)
     done["simulation"] = _attempt(partial(play, progress=playing))
+    left_out = {what: reason for what, (_, reason) in done.items() if reason}
+    applies = set(jobs) if controller.design[0].ports else set(sweeps)
     return Simulated(
         verification=done["simulation"][0],
         large_signal=tuple(done[what][0] for what in sweeps if not done[what][1]),
         passivity=done["passivity"][0],
         environments=done["environments"][0],
-        left_out={what: reason for what, (_, reason) in done.items() if reason},
+        left_out=left_out,
+        unchecked=tuple(what for what in left_out if what in applies - {NOTHING_LARGE}),
         **devices,
     )
 
@@ -347,7 +356,7 @@ def _list_sweeps(
     design, values = controller.design
     rub = any(has_friction(plant, parameters) for plant in plants.values())
     if controller.command_limit is None and not rub:  # one reason for all of them
-        return {"large signals": partial(_sweep, controller, design.name, design, values)}
+        return {NOTHING_LARGE: partial(_sweep, controller, design.name, design, values)}
     label = next((name for name, plant in plants.items() if plant is design), design.name)
     on = {label: (design, values)} | {name: (plant, parameters) for name, plant in plants.items() if name != label}
     return {f"large signals on {name}": partial(_sweep, controller, name, *pair) for name, pair in on.items()}

@@ -78,6 +78,7 @@ class StoredSimulation:
     seed: int
     large_signal: tuple[LargeSignal, ...]
     left_out: Mapping[str, str]
+    unchecked: tuple[str, ...] = ()
 
 
 @record

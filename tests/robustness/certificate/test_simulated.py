@@ -14,6 +14,8 @@ from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.running import closed_loop
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
+from seaopt.reporting.sections import judge
+from seaopt.reporting.sections.data import Commands
 from seaopt.robustness import run_simulations, verify
 from seaopt.robustness.verification import impedance_steps, large_signal, limit_cycles, scenarios, verification
 from tests.laws import scaled
@@ -138,6 +140,7 @@ def test_what_cannot_be_had_is_said(stand, thor):
     assert found.passivity_dict() is None
     assert "no port at link 2" in found.left_out["passivity"]
     assert "no port at link 2" in found.simulation_dict()["left_out"]["environments"]
+    assert found.unchecked == ()  # none of them applies
 
 
 @pytest.mark.slow
@@ -186,3 +189,26 @@ def test_what_breaks_is_said_and_the_rest_is_had(controller, stand, thor, monkey
     assert found.passivity_dict() is None
     assert set(found.left_out) == {"passivity", "large signals on stand"}
     assert found.environments is not None
+    assert set(found.unchecked) == set(found.left_out)
+
+
+def test_what_applies_and_could_not_be_checked_stands_beside_the_verdict(
+    controller, stand, thor, monkeypatch, tmp_path
+):
+    """It was a note below a certificate that is met, as of a plant to which it does not apply."""
+
+    def broken(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(sys.modules["seaopt.robustness.certificate.simulated"], "large_signal", broken)
+    found = so.certify(controller, {"stand": stand}, thor, samples=5)
+    verdict = judge(found, Commands())
+    assert verdict.met and verdict.text.endswith("large signals on stand NOT CHECKED")
+    assert "Singular matrix" in str(verdict.reasons[-1]) and flatten(repr(found)).count("Singular matrix") == 1
+    content = json.loads(to_json(found.to_dict()))
+    assert "Singular matrix" in content["unchecked"]["large signals on stand"]
+    assert content["simulation"]["unchecked"] == ["large signals on stand"]
+    page = so.write_report([controller, found], tmp_path / "report.html").read_text()
+    assert "not checked" in page and "NOT CHECKED" in page
+    again = so.Certificate.from_dict(content, controller, {"stand": stand}, thor)
+    assert again.unchecked == found.unchecked

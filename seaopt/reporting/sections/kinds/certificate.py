@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from seaopt.control import Controller, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT, OTHER_NOISE
@@ -69,7 +70,17 @@ SWINGS = (
 
 
 def judge(certificate: Certificate, commands: Commands) -> Verdict:
-    """Return the verdict on a certificate."""
+    """Return the verdict on a certificate, and what could not be checked."""
+    verdict = _judge_checked(certificate, commands)
+    unchecked = certificate.unchecked
+    if not unchecked:
+        return verdict
+    text = f"{verdict.text}; {join_words(list(unchecked))} NOT CHECKED"
+    reasons = [Reason(what=f"{what} could not be checked", where=why) for what, why in unchecked.items()]
+    return replace(verdict, text=text, reasons=(*verdict.reasons, *reasons))
+
+
+def _judge_checked(certificate: Certificate, commands: Commands) -> Verdict:
     if certificate.schedule is not None:
         return _judge_schedule(certificate, certificate.schedule, commands)
     draws = certificate.monte_carlo
@@ -197,7 +208,8 @@ def describe(certificate: Certificate) -> list[Section]:
             _tabulate_places(certificate, certificate.schedule),
             *list_notes("the schedule's certificate", certificate.notes),
         ]
-    left_out = [] if certificate.simulated is None else list_left_out(certificate.simulated)
+    simulated = certificate.simulated
+    left_out = [] if simulated is None else list_left_out(simulated, simulated.unchecked)
     return [
         _list_requirements(certificate),
         Section(
@@ -355,6 +367,8 @@ def _list_requirements(certificate: Certificate) -> Section:
         )
         for row, count in groups
     )
+    unchecked = Mark(text="not checked", style="warning")  # why is beside the verdict
+    rows += tuple((unchecked, what, MISSING, "", "", "") for what in certificate.unchecked)
     head = ("verdict", "requirement", "value", "limit", "unit", "where")
     remark = (
         "Worst case, of its limits: the largest share of a limit that the worst parameters found use; 1 is all of it."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 import numpy as np
 
@@ -39,9 +39,9 @@ def describe(result: Simulated | LargeSignal) -> list[Section]:
     ]
 
 
-def list_left_out(simulated: Simulated) -> list[str]:
-    """Return what was not simulated, and why."""
-    return [f"no {what}: {reason}" for what, reason in simulated.left_out.items()]
+def list_left_out(simulated: Simulated, shown: Container[str] = ()) -> list[str]:
+    """Return what was not simulated, and why, but for what is `shown` elsewhere."""
+    return [f"no {what}: {reason}" for what, reason in simulated.left_out.items() if what not in shown]
 
 
 def summarise_findings(simulated: Simulated) -> Iterator[str]:
