@@ -82,6 +82,7 @@ def compare(
     response, count = comparison.response, comparison.f.size
     draws = draws[:SIMULATED] if dry else draws
     sets = [values, *(place_values(plant, values, draw) for draw in draws)]
+    comparison = comparison.settle(values) if dry else comparison
     simulated = comparison.simulate(sets) if dry else []
     drawn = [*map(comparison.read, simulated)] if dry else comparison.predict(sets)
     model, drawn = drawn[0], np.array(drawn[1:]).reshape(-1, count)

@@ -4,7 +4,9 @@ With dry friction the model's response is that of the same law on the nonlinear 
 reference and cut as the log is, since it depends on amplitude; two periods of each set of phases do. Noise of what the
 law reads, which is in its command, shakes the motor through its friction: where it makes much of the command the model
 has as much of it, twice, once turned about zero. In the mean of both what noise adds to the lines is gone to first
-order, and what it makes of friction is left; that depends on the noise, of which one draw is taken.
+order, and what it makes of friction is left, which depends on the noise. All models have the same, so that they differ
+by what they are; what it makes of them beside the mean over several draws is told once, of the nominal one
+(`Comparison.settle`): by that factor all are corrected, and the std of that mean is part of what the lines are off by.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ from seaopt.signals import measure_white
 
 TOLERATED = 0.02  # of the response, by which a machine may be off everything drawn
 SHAKES = 0.3  # of the command's rms, from which on noise is simulated, too
+SHAKEN = 4  # draws of such noise
 GRID = 400  # frequencies over which a law's response to noise is averaged
 Lines = Complex[np.ndarray, " m"]
 
@@ -51,6 +54,8 @@ class Comparison:
     rate: float = 1.0  # at which the model's law is stepped, over what the clock of the logs says
     simulated: bool = False  # whether the model is, without dry friction too
     apart: Controller | None = None  # the law and its outer loop as they run, where `controller` has both in one
+    correction: Lines | float = 1.0  # of the model, from one draw of the noise that shakes it to the mean of several
+    scatter: Float[np.ndarray, " m"] | float = 0.0  # std of that mean
 
     @property
     def plant(self) -> Plant:
@@ -75,8 +80,11 @@ class Comparison:
 
     @property
     def std(self) -> Float[np.ndarray, " m"]:
-        """Its std, or the accuracy of the model where the periods of a log are more alike than that."""
-        return np.concatenate([np.maximum(ratio.std, RTOL * np.abs(ratio.value)) for ratio in self.ratios])
+        """Its std, or the accuracy of the model where the periods of a log are more alike than that; with that of the
+        mean of what noise makes of the model.
+        """
+        measured = np.concatenate([np.maximum(ratio.std, RTOL * np.abs(ratio.value)) for ratio in self.ratios])
+        return np.hypot(measured, self.scatter)
 
     @property
     def widening(self) -> float:
@@ -96,7 +104,8 @@ class Comparison:
     def radius(self, alpha: float) -> Float[np.ndarray, " m"]:
         """Return the radii of its discs, all of which hold the truth but with the probability `alpha`."""
         each = alpha / self.f.size
-        return np.concatenate([ratio.disc(each)[1] for ratio in self.ratios])
+        measured = np.concatenate([ratio.disc(each)[1] for ratio in self.ratios])
+        return np.hypot(measured, math.sqrt(-math.log(each)) * self.scatter)
 
     def misfit(self, model: Lines) -> float:
         """Return the sum of squares of a model's difference, over the std."""
@@ -117,18 +126,28 @@ class Comparison:
         sampled = sample(seen, law.delay(values), self.names, law.per_effort, *timing)
         return np.concatenate([sampled.responses(self.rate * part.f).ravel() for part in self.measured])
 
-    def simulate(self, sets: Sequence[ParameterSet]) -> list[list[Blocks]]:
+    def settle(self, values: ParameterSet) -> Comparison:
+        """Return the comparison with the mean of what noise that shakes the machine makes of the model with some
+        values, and how sure that mean is.
+        """
+        if all(self._find_shaking(ticks) is None for ticks in self.logs):
+            return self
+        drawn = np.array([self.read(*self.simulate([values], seed)) for seed in range(SHAKEN)])
+        mean, std = np.mean(drawn, axis=0), np.sqrt(np.var(drawn, axis=0, ddof=1) / SHAKEN)
+        return replace(self, correction=self.correction * mean / drawn[0], scatter=std)
+
+    def simulate(self, sets: Sequence[ParameterSet], seed: int = 0) -> list[list[Blocks]]:
         """Return the periods of the law on the nonlinear plant with each of some values, under the logged references
-        and cut as the logs are, by amplitude.
+        and cut as the logs are, by amplitude. `seed`: of the noise, where that shakes the machine.
         """
         source, share = replace(self.controller, outer=None), 1.0  # what was given is the force law's reference
         if self.apart is not None and self.apart.outer is not None:
             source, share = replace(self.apart, design=source.design), 1.0 / self.apart.outer.per_given
-        runs = [self._run(source, sets, share, ticks) for ticks in self.logs]
+        runs = [self._run(source, sets, share, ticks, seed) for ticks in self.logs]
         return [self._cut(runs, k) for k in range(len(sets))]
 
     def _run(
-        self, source: Controller, sets: Sequence[ParameterSet], share: float, ticks: Ticks
+        self, source: Controller, sets: Sequence[ParameterSet], share: float, ticks: Ticks, seed: int
     ) -> Mapping[str, Float[np.ndarray, "runs n"]]:
         """Return the outputs of runs under a share of a log's reference, with the noise of its readings where that
         shakes the motor.
@@ -138,8 +157,9 @@ class Comparison:
         if shaking is None:
             alone = run_design(source, sets, reference, rate=self.rate).outputs
             return {name: rows[:, ::every] for name, rows in alone.items()}
-        gains = np.repeat([1.0, -1.0], len(sets))
-        both = run_design(source, [*sets, *sets], reference, sensors=shaking, noise_gain=gains, rate=self.rate)
+        turned = np.repeat([1.0, -1.0], len(sets))
+        twice = [*sets, *sets]
+        both = run_design(source, twice, reference, sensors=shaking, seed=seed, noise_gain=turned, rate=self.rate)
         return {name: rows.reshape(2, len(sets), -1).mean(axis=0)[:, ::every] for name, rows in both.outputs.items()}
 
     def _find_shaking(self, ticks: Ticks) -> Sensors | None:
@@ -174,7 +194,7 @@ class Comparison:
             shown = dict(zip(self.controller.signals, rows.measured.swapaxes(0, 1), strict=True)) | dict(rows.beside)
             effort = np.mean(rows.effort / rows.reference, axis=0)
             parts += [np.mean(shown[name] / rows.reference, axis=0) / effort for name in self.names]
-        return np.concatenate(parts)
+        return self.correction * np.concatenate(parts)
 
 
 def _shift_early(values: ParameterSet, period_s: float) -> tuple[int, ParameterSet]:
