@@ -90,7 +90,7 @@ def test_the_cascade_is_assessed_with_its_encoder(script):
     assert 0.0 < judged["phase_margin_deg"] - found.phase_margin_deg < late
     score = scorecard({"cascade": controller})["cascade"]
     assert score.passive_to_hz == pytest.approx(113.5, abs=0.1)
-    system = controller.close(*controller.design).system()
+    system = controller.close(*controller.design).system().block
     z = np.exp(1j * np.linspace(0.0, np.pi, 20_001)[1:])
     inner = z[:, None, None] * np.eye(len(system.a)) - system.a
     x = np.linalg.solve(inner, np.broadcast_to(system.b[:, 2:3] + 0j, (z.size, len(system.a), 1)))[:, :, 0]

@@ -76,4 +76,5 @@ def close_link(link: ControlledLink, velocity_filter_s: float, load: Load | None
     a, b, c, d = (part[0] for part in sampled)
     plant, outer = make_plant(a, b, c, d, link.delay_samples), link.speed_filter(velocity_filter_s)
     plant = replace(plant, outputs=(*plant.outputs[:-1], POSITION))
-    return MovingLoop(block=connect([plant, link.law.block, outer.block], [REFERENCE], [POSITION, SPEED]), outer=outer)
+    blocks = [plant, link.law.block, outer.filter_speed()]
+    return MovingLoop(block=connect(blocks, [REFERENCE], [POSITION, SPEED]), outer=outer)

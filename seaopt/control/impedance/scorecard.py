@@ -196,6 +196,7 @@ def _find_noise_rms(controller: Controller, plant: Plant, parameters: ParameterS
     noise = 0 if len(controller.signals) == 1 else 2  # of several signals the inputs are w, reference and noises
     if not np.max(np.abs(system.poles), initial=0.0) < 1.0:
         return np.inf
-    driven = np.outer(system.b[:, noise], system.b[:, noise])
-    covariance: Any = solve_discrete_lyapunov(system.a, driven)
-    return float(np.sqrt(system.c[1] @ covariance @ system.c[1] + system.d[1, noise] ** 2))
+    block = system.block
+    drive, effort = block.b[:, noise], block.c[1]
+    covariance: Any = solve_discrete_lyapunov(block.a, np.outer(drive, drive))
+    return float(np.sqrt(effort @ covariance @ effort + block.d[1, noise] ** 2))

@@ -43,7 +43,17 @@ from seaopt.control.loops.minimal import (
     split_integrators,
 )
 from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
-from seaopt.control.systems.block import COMMAND, EFFORT, REFERENCE, Block, name_readings
+from seaopt.control.systems.block import (
+    COMMAND,
+    EFFORT,
+    GIVEN,
+    READ,
+    REFERENCE,
+    Block,
+    connect,
+    name_readings,
+    subtract_last,
+)
 from seaopt.control.systems.resolvent import Resolvent
 from seaopt.errors import ControlError
 from seaopt.formatting import format_count
@@ -101,6 +111,15 @@ class Law:
         rows = np.ones((2, 1))
         inputs = (REFERENCE, *name_readings(self.d.size - 1))
         return Block(a=self.a, b=self.b, c=rows * self.c, d=rows * self.d, inputs=inputs, outputs=(EFFORT, COMMAND))
+
+    @classmethod
+    def of(cls, block: Block, sample_time_s: float) -> Law:
+        """Return the law of a block from the reference and what is measured, in order, to an effort."""
+        return cls(a=block.a, b=block.b, c=block.c[0], d=block.d[0], sample_time_s=sample_time_s)
+
+    def connected(self, blocks: Sequence[Block], inputs: Sequence[str]) -> Law:
+        """Return the law that this one and blocks around it make, of some signals: reference first, then readings."""
+        return Law.of(connect([self.block, *blocks], inputs, [EFFORT]), self.sample_time_s)
 
     @property
     def remainder(self) -> tuple[Float[np.ndarray, "l l"], Float[np.ndarray, "l k"], Float[np.ndarray, " l"]]:
@@ -281,24 +300,18 @@ class Law:
         :math:`v_k = (\theta_k - \theta_{k-1})/T_s`: half a sample late, and rounded to one step of the encoder per
         sample. As a part of the law that is in every figure and every simulation.
         """
-        n, ts, per_step = self.c.size, self.sample_time_s, np.ones(self.d.size)
-        per_step[column] /= self.sample_time_s
-        b, d = self.b * per_step, self.d * per_step
-        a = np.block([[self.a, -b[:, [column]]], [np.zeros((1, n + 1))]])  # the last state is the position before
-        return Law.from_state_space(a, np.vstack([b, np.eye(d.size)[column]]), np.append(self.c, -d[column]), d, ts)
+        inputs = list(self.block.inputs)
+        speed, inputs[column] = inputs[column], READ
+        law = self.connected([subtract_last(READ, speed, gain=1.0 / self.sample_time_s)], inputs)
+        return Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
 
     def reading(self, feedback: TransferFunction) -> Law:
         """Return the law u - C(q) y that reads one signal more, in a last column of b."""
-        from scipy.linalg import block_diag  # deferred: scipy is slow to load
+        return self.connected([feedback.block(READ, EFFORT, -1.0)], [*self.block.inputs, READ])
 
-        a, b, c, d = feedback.state_space()
-        return replace(
-            self,
-            a=block_diag(self.a, a),
-            b=block_diag(self.b, b[:, None]),
-            c=np.concatenate([self.c, -c]),
-            d=np.append(self.d, -d),
-        )
+    def behind(self, part: TransferFunction) -> Law:
+        """Return the law whose reference is behind a filter."""
+        return self.connected([part.block(GIVEN, REFERENCE)], [GIVEN, *self.block.inputs[1:]])
 
     def scaled(self, factor: float) -> Law:
         """Return the law with its output times a factor; the chain is read as before."""

@@ -166,13 +166,13 @@ class Loop:
         """
         import control  # deferred: slow to import
 
-        system, signals = self.system(), self.law.d.size - 1
+        block, signals = self.system().block, self.law.d.size - 1
         names = {"inputs": ["noise", "reference"], "outputs": ["measured", "effort"]}
         if signals > 1:
             noises = [f"noise{number}" for number in range(1, signals + 1)]
             names = {"inputs": ["disturbance", "reference", *noises], "outputs": ["command", "effort", "measured1"]}
         ts = self.plant.sample_time_s
-        return control.StateSpace(system.a, system.b, system.c, system.d, ts, name="loop", **names)
+        return control.StateSpace(block.a, block.b, block.c, block.d, ts, name="loop", **names)
 
     def eigenvalues(self) -> ComplexN:
         """Return the closed loop's eigenvalues."""
@@ -188,8 +188,8 @@ class Loop:
         What slow poles leave is read in closed form: of :math:`x^+ = A x + B`, :math:`y = C x + D` the response is
         :math:`G(1) - C A^k (I - A)^{-1} B` after k samples.
         """
-        system = self.system()
-        a, b, c = system.a, system.b[:, 1], system.c[0]
+        block = self.system().block
+        a, b, c = block.a, block.b[:, 1], block.c[0]
         samples = max(round(seconds / self.plant.sample_time_s), 0)
         return float(c @ np.linalg.matrix_power(a, samples) @ np.linalg.solve(np.eye(b.size) - a, b))
 
@@ -207,11 +207,11 @@ class Loop:
         """
         system = self.system()
         rows = [int(system.table.outputs[TRACKING]), 1]  # what is measured, and the effort
-        drive, through, c = system.b[:, 1], system.d[rows, 1], system.c[rows]
-        x, out = np.zeros(len(system.a)), np.empty((reference.size, 2))
+        a, drive, through, c = system.block.a, system.block.b[:, 1], system.block.d[rows, 1], system.block.c[rows]
+        x, out = np.zeros(len(a)), np.empty((reference.size, 2))
         for k, r in enumerate(reference):
             out[k] = c @ x + r * through
-            x = system.a @ x + r * drive
+            x = a @ x + r * drive
         return out[:, 0], out[:, 1]
 
     def grid(self) -> Frequencies:

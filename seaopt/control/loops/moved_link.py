@@ -28,9 +28,10 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import DiscLoop
 from seaopt.control.loops.measured.plant import MeasuredPlant
-from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.control.loops.outer_loop import POSITION, SPEED, OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import Frequencies, Response
+from seaopt.control.systems.block import GIVEN, REFERENCE, add_up
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
 from seaopt.records import record
@@ -77,18 +78,13 @@ def enclose_law(
     which of the measured signals is the link's position; it is one more, the last, where none of them is. `kept` is of
     `keep_share`. `of_force`: of the force law's reference in place of x_0.
     """
-    (n, columns), column = law.b.shape, -1 if signal is None else 1 + signal
-    b, d = np.zeros((n + 1, columns + (signal is None))), np.zeros(columns + (signal is None))
-    b[:n, 1:columns], d[1:columns] = law.b[:, 1:], law.d[1:]
-    stiffness, damping, pole, rate = outer.numbers
-    drive, through = np.append(law.b[:, 0], 0.0), law.d[0]
-    b[:, column] -= (stiffness + damping * rate) * drive
-    b[n, column] += (pole - kept) * rate
-    d[column] -= (stiffness + damping * rate) * through
+    _, *readings = law.block.inputs
+    position = POSITION if signal is None else readings[signal]
+    stiffness, damping, _, _ = outer.numbers
     per_given = 1.0 if of_force else outer.per_given
-    b[:, 0], d[0] = per_given * drive, per_given * through
-    a = np.block([[law.a, -damping * law.b[:, :1]], [np.zeros((1, n)), np.full((1, 1), pole)]])
-    return Law(a=a, b=b, c=np.append(law.c, -damping * through), d=d, sample_time_s=law.sample_time_s)
+    asked = add_up(REFERENCE, {GIVEN: per_given, position: -stiffness, SPEED: -damping})
+    inputs = [GIVEN, *readings, *[POSITION] * (signal is None)]
+    return law.connected([outer.filter_speed(position, kept), asked], inputs)
 
 
 def respond_outer(outer: OuterLoop, f: Frequencies, kept: float = 1.0) -> Response:

@@ -169,11 +169,11 @@ class OuterLoop:
         speed = np.asarray(lfilter([self.rate, -self.rate], [1.0, -self.pole], positions - positions[..., :1]))
         return self.direction * (self.stiffness * (references - positions) - self.damping * speed)
 
-    @property
-    def block(self) -> Block:
-        """The filtered speed of the position."""
-        a, rate = np.full((1, 1), self.pole), self.rate
-        return Block(a=a, b=rate * (a - 1.0), c=np.ones((1, 1)), d=rate + 0.0 * a, inputs=(POSITION,), outputs=(SPEED,))
+    def filter_speed(self, position: str = POSITION, kept: float = 1.0) -> Block:
+        """Return the filtered speed of a position, of which a share is taken off the next."""
+        unit = np.ones((1, 1))
+        a, b, d = self.pole * unit, self.rate * (self.pole - kept) * unit, self.rate * unit
+        return Block(a=a, b=b, c=unit, d=d, inputs=(position,), outputs=(SPEED,))
 
     def difference(self, z: ComplexM) -> ComplexM:
         """Return D at points of the z plane."""

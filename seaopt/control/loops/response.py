@@ -33,6 +33,7 @@ Control Signals Systems 2, 1989; Bruinsma, Steinbuch, Systems & Control Letters 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -92,20 +93,17 @@ def list_curves(measured: int) -> Curves:
 class ClosedLoop:
     """A closed loop from (noise, reference) to (measured force, motor force), balanced; or of `list_curves`."""
 
-    a: MatrixNN  # a, b, c, d: shapes (n, n), (n, i), (o, n) and (o, i)
-    b: Float[np.ndarray, "n i"]
-    c: Float[np.ndarray, "o n"]
-    d: Float[np.ndarray, "o i"]
-    resolvent: Resolvent  # of `a`, `b` and `c`
+    block: Block
+    resolvent: Resolvent  # of it
     opened: ComplexN  # the poles of plant and law, which are the zeros of S
     # the matrices of plant and law whose eigenvalues those are, but for the law's integrators
-    blocks: tuple[Float[np.ndarray, "np np"], Float[np.ndarray, "nk nk"]]
+    matrices: tuple[Float[np.ndarray, "np np"], Float[np.ndarray, "nk nk"]]
     table: Curves  # its curves
     through: VectorK  # their direct terms
 
     @property
     def poles(self) -> ComplexN:
-        """The eigenvalues of `a`."""
+        """The eigenvalues of its matrix."""
         return self.resolvent.poles
 
     def curves(self, theta: Angles) -> Complex[np.ndarray, "k m"]:
@@ -115,14 +113,14 @@ class ClosedLoop:
     def sensitivity(self, theta: Angles) -> ComplexM:
         """Return S as a product over its zeros and poles: exact where it vanishes, at an integrator."""
         z = np.exp(1j * theta)[:, None]
-        return self.d[0, 0] * np.prod((z - self.opened) / (z - self.poles), axis=1)
+        return self.block.d[0, 0] * np.prod((z - self.opened) / (z - self.poles), axis=1)
 
     def resolution(self) -> VectorN:
         """Return how well each pole of plant and law is known: rounding times its condition, large of a double one. The
         first-order bound of an eigenvalue's error, of the balanced matrix (Golub, Van Loan, Matrix Computations,
         7.2.2).
         """
-        plant, law = (_resolution(block) for block in self.blocks)
+        plant, law = map(_resolution, self.matrices)
         return np.concatenate([plant, np.zeros(self.opened.size - plant.size - law.size), law])
 
     def differentiate(
@@ -153,28 +151,32 @@ class ClosedLoop:
 
     def modulus(self, curve: int, level: float) -> Pencil:
         """Return the pencil whose eigenvalues on the circle are where abs(curve) = level."""
-        table = self.table
-        c = self.c[table.outputs[curve]] * (table.factors[curve] / level)
+        table, block = self.table, self.block
+        c = block.c[table.outputs[curve]] * (table.factors[curve] / level)
         d = float(self.through[curve]) / level
-        return self._pencil(self.b[:, table.inputs[curve]], (np.outer(c, c), c * d), (d * c, 1.0, d * d - 1.0))
+        return self._pencil(block.b[:, table.inputs[curve]], (np.outer(c, c), c * d), (d * c, 1.0, d * d - 1.0))
 
     def equal(self) -> Pencil:
         """Return the pencil whose eigenvalues on the circle are where abs(L) = 1, that is 2 Re S = 1."""
-        c, none = self.c[0], np.zeros_like(self.a)
-        return self._pencil(self.b[:, 0], (none, c), (c, 1.0, 2.0 * self.d[0, 0] - 1.0))
+        return self._compare_s(1.0, 2.0 * self.block.d[0, 0] - 1.0)
 
     def real(self) -> Pencil:
         """Return the pencil whose eigenvalues on the circle are where L is real, that is Im S = 0."""
-        c, none = self.c[0], np.zeros_like(self.a)
-        return self._pencil(self.b[:, 0], (none, c), (c, -1.0, 0.0))
+        return self._compare_s(-1.0, 0.0)
+
+    def _compare_s(self, sign: float, direct: float) -> Pencil:
+        block = self.block
+        c, none = block.c[0], np.zeros_like(block.a)
+        return self._pencil(block.b[:, 0], (none, c), (c, sign, direct))
 
     def _pencil(self, b: VectorN, costate: tuple[MatrixNN, VectorN], last: tuple[VectorN, float, float]) -> Pencil:
         n = b.size
         m, k = np.zeros((2 * n + 1, 2 * n + 1)), np.zeros((2 * n + 1, 2 * n + 1))
-        m[:n, :n], m[:n, -1] = self.a, b
+        a = self.block.a
+        m[:n, :n], m[:n, -1] = a, b
         m[n:-1, n:-1] = k[:n, :n] = np.eye(n)
         m[-1, :n], m[-1, n:-1], m[-1, -1] = last[0], last[1] * b, last[2]
-        k[n:-1, :n], k[n:-1, n:-1], k[n:-1, -1] = costate[0], self.a.T, costate[1]
+        k[n:-1, :n], k[n:-1, n:-1], k[n:-1, -1] = costate[0], a.T, costate[1]
         return m, k
 
 
@@ -186,8 +188,8 @@ def close(plant: Block, law: Law) -> ClosedLoop:
     inputs, outputs = (regulated, REFERENCE), (regulated, EFFORT)
     if measured > 1:
         inputs, outputs = (COMMAND, REFERENCE, *plant.outputs), (COMMAND, EFFORT, regulated)
-    system = connect([plant, law.block], inputs, outputs)
-    a, b, c, d, n = system.a, system.b, system.c, system.d, len(system.a)
+    block = connect([plant, law.block], inputs, outputs)
+    a, b, c, d, n = block.a, block.b, block.c, block.d, len(block.a)
     table = list_curves(measured)
     through = d[table.outputs, table.inputs] * table.factors + table.offsets
     opened = np.full(n, np.inf + 0j)
@@ -203,16 +205,14 @@ def close(plant: Block, law: Law) -> ClosedLoop:
             balanced = a * scale / scale[:, None], b / scale[:, None], c * scale
         if all(np.all(np.isfinite(matrix)) for matrix in balanced):
             a, b, c = balanced
+            block = replace(block, a=a, b=b, c=c)
         resolvent = Resolvent.of(a, b, c)
         opened = np.concatenate([np.linalg.eigvals(plant.a), law.poles]).astype(complex)
     return ClosedLoop(
-        a=a,
-        b=b,
-        c=c,
-        d=d,
+        block=block,
         resolvent=resolvent,
         opened=opened,
-        blocks=(plant.a, law.remainder[0]),
+        matrices=(plant.a, law.remainder[0]),
         table=table,
         through=through,
     )

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from seaopt.codec import Constraints
+from seaopt.control.systems.block import Block
 from seaopt.records import record
 from seaopt.signals import MatrixNN, VectorM, VectorN
 
@@ -40,3 +41,9 @@ class TransferFunction:
             a[0], b[0] = -den[1:], 1.0
             a[1:, :-1] = np.eye(n - 1)
         return a, b, num[1:] - num[0] * den[1:], float(num[0])
+
+    def block(self, read: str, output: str, gain: float = 1.0) -> Block:
+        """Return it from one signal to another, times a gain."""
+        a, b, c, d = self.state_space()
+        c, d = gain * c[None], np.full((1, 1), gain * d)
+        return Block(a=a, b=b[:, None], c=c, d=d, inputs=(read,), outputs=(output,))

@@ -65,7 +65,6 @@ from seaopt.control.mpc.step import (
     MPCStep,
     ReadsLink,
     add_terms,
-    put_behind,
     read_references,
     shape_references,
 )
@@ -465,7 +464,7 @@ class ForceMPC(ReadsLink, Result, Worded):
     def law(self) -> Law:
         """What it is while no limit is active, from reference and measurement to effort."""
         plan, low_pass = self.unlimited().scaled(1.0 / self.per_effort), self.spec.low_pass
-        law = plan if low_pass is None else put_behind(plan, low_pass)
+        law = plan if low_pass is None else plan.behind(low_pass)
         return law if self.link_filter is None else law.reading(self.link_filter[0])
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from jaxtyping import Float, Int
 from seaopt.control.laws.controller import ClosesLoops
 from seaopt.control.laws.plausibility import GateState, is_number
 from seaopt.control.loops.compensation.terms import FORGOTTEN, Compensation, Memory
-from seaopt.control.loops.law import Law
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.estimator import EstimatorState
 from seaopt.errors import ControlError
@@ -169,14 +167,6 @@ def rest_filter(path: TransferFunction, value: float) -> tuple[float, ...]:
 def find_rest_gain(path: TransferFunction) -> float:
     """Return a filter's gain at rest."""
     return float(np.sum(path.num) / np.sum(path.den))
-
-
-def put_behind(law: Law, low_pass: TransferFunction) -> Law:
-    """Return a law whose reference is behind a low-pass."""
-    inner, into, seen, direct = low_pass.state_space()
-    a = np.block([[law.a, np.outer(law.b[:, 0], seen)], [np.zeros((into.size, law.c.size)), inner]])
-    b = np.vstack([law.b * [direct, 1.0], np.column_stack([into, 0.0 * into])])
-    return replace(law, a=a, b=b, c=np.append(law.c, law.d[0] * seen), d=law.d * [direct, 1.0])
 
 
 def shape_references(

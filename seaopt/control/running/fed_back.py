@@ -34,9 +34,9 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.outer_run import enclose
 from seaopt.control.loops.compensation.terms import Compensation, compensate
 from seaopt.control.loops.drift import FORGOTTEN, add_forgetful, leave_out_drift
-from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.moved_link import find_position, show_position
+from seaopt.control.systems.block import EFFORT, REFERENCE, add_up, subtract_last
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import SLIDING, friction_states, name_states
@@ -142,15 +142,9 @@ def close_terms(controller: Controller, plant: Plant) -> Controller:
     """
     if not feeds_back(controller, plant):
         return controller
-    (law, signals), shown = enclose(controller, plant, of_force=True), _list_shown(controller, plant)
-    if WEIGHT in shown:
-        law = replace(law, b=np.column_stack([law.b, law.b[:, 0]]), d=np.append(law.d, law.d[0]))
-        signals = (*signals, WEIGHT)
-    if AGAINST in shown:
-        n, columns = law.b.shape
-        a, b = np.zeros((n + 1, n + 1)), np.zeros((n + 1, columns + 1))
-        a[:n, :n], b[:n, :columns], b[n, columns] = law.a, law.b, 1.0  # the last sample's is kept
-        kept = np.exp(-FORGOTTEN) if TURNED in plant.states else 1.0
-        c, d = np.append(law.c, -kept), np.append(law.d, 1.0)
-        law, signals = Law(a=a, b=b, c=c, d=d, sample_time_s=law.sample_time_s), (*signals, AGAINST)
-    return replace(controller, law=law, reads=signals, compensation=None, outer=None)
+    law, signals = enclose(controller, plant, of_force=True)
+    kept = np.exp(-FORGOTTEN) if TURNED in plant.states else 1.0
+    ways = {WEIGHT: add_up(REFERENCE, {WEIGHT: 1.0}), AGAINST: subtract_last(AGAINST, EFFORT, kept)}
+    shown = [name for name in ways if name in _list_shown(controller, plant)]
+    law = law.connected([ways[name] for name in shown], [*law.block.inputs, *shown])
+    return replace(controller, law=law, reads=(*signals, *shown), compensation=None, outer=None)

@@ -7,13 +7,15 @@ under it. With the blocks side by side, :math:`u = M y + L w` of zeros and ones,
 .. math::
     y = (I - D M)^{-1} (C x + D L w), \qquad x^+ = A x + B (M y + L w) .
 
-This is where every loop is closed. What has to be exact to the last bit, an integrator's pole above all, is not left to
-it: laws are put together by `seaopt.control.laws.assembly`, and loops are judged by what that gives.
+This is where every loop is closed. Where no signal comes back to itself within a sample, the inverse is
+:math:`I + D M + (D M)^2 + \dots`, which ends: what does not feed a state is zero there to the last bit, so that a law
+keeps the integrators that it has set apart (`seaopt.control.loops.law`). What stands in series with them, and leaves
+them apart, is put together by `seaopt.control.laws.assembly`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -26,6 +28,7 @@ Matrix = Float[np.ndarray, "... _ _"]
 
 REFERENCE, EFFORT, COMMAND = "reference", "effort", "command"
 LATE = "late command"  # as it reaches the plant
+GIVEN, READ = "given", "read"  # what a law's reference is made of, and what it reads besides
 
 
 @record(eq=False)
@@ -38,6 +41,18 @@ class Block:
     d: Matrix
     inputs: Names
     outputs: Names
+
+
+def add_up(output: str, gains: Mapping[str, float]) -> Block:
+    """Return a signal that is a sum of others, each times a gain."""
+    none, d = np.zeros((0, 0)), np.array([list(gains.values())])
+    return Block(a=none, b=np.zeros((0, d.size)), c=none.T.reshape(1, 0), d=d, inputs=tuple(gains), outputs=(output,))
+
+
+def subtract_last(read: str, output: str, kept: float = 1.0, gain: float = 1.0) -> Block:
+    """Return a signal less a share of what it was a sample before, times a gain."""
+    unit = np.ones((1, 1))
+    return Block(a=0.0 * unit, b=unit, c=-kept * gain * unit, d=gain * unit, inputs=(read,), outputs=(output,))
 
 
 @cache
@@ -85,7 +100,7 @@ def connect(blocks: Sequence[Block], inputs: Sequence[str], outputs: Sequence[st
     states = a.shape[-1]
     driven = d @ fed
     of_all = np.concatenate([c, driven], axis=-1)
-    signals = np.linalg.solve(np.eye(len(into[0])) - d @ into, of_all)  # y of the states and of w
+    signals = _pass_on(d @ into, of_all, len(blocks))  # y of the states and of w
     taken = into @ signals
     taken[..., states:] += fed
     shown = read @ signals
@@ -99,6 +114,17 @@ def connect(blocks: Sequence[Block], inputs: Sequence[str], outputs: Sequence[st
         inputs=tuple(inputs),
         outputs=tuple(outputs),
     )
+
+
+def _pass_on(through: Matrix, of_all: Matrix, most: int) -> Matrix:
+    """Return (I - through)^-1 of what is put into every signal: without a loop the sum of at most so many powers."""
+    signals = passed = of_all
+    for _ in range(most):
+        passed = through @ passed
+        if not np.any(passed):
+            return signals
+        signals = signals + passed
+    return np.linalg.solve(np.eye(through.shape[-1]) - through, of_all)
 
 
 @cache

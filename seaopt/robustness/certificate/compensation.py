@@ -31,6 +31,7 @@ from seaopt.control.compensation.compensate import ENOUGH, find_compensation_mar
 from seaopt.control.laws.outer_run import close, enclose
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.sampled_plant import find_rest
+from seaopt.control.systems.block import EFFORT, REFERENCE, add_up, name_readings
 from seaopt.errors import ControlError
 from seaopt.executors import Shared
 from seaopt.parameters import Parameter, ParameterSet
@@ -232,20 +233,13 @@ def find_radius(
     """Return the largest eigenvalue of the sampled loop, sliding, with further feedback. `weight` feeds the reference
     by the link's position, `ripple` the effort by the motor's: each an output and a slope.
     """
-    law, signals = enclose(controller, plant)
-    b, d = law.b, law.d
-    for reads, _ in filter(None, (weight, ripple)):
-        if reads not in signals:
-            signals = (*signals, reads)
-            b, d = np.column_stack([b, np.zeros(law.c.size)]), np.append(d, 0.0)
-    b, d = b.copy(), d.copy()
-    if weight is not None:  # of the force law's reference
-        column, force_law = 1 + signals.index(weight[0]), controller.law
-        b[: force_law.c.size, column] += weight[1] * force_law.b[:, 0]
-        d[column] += weight[1] * force_law.d[0]
-    if ripple is not None:
-        d[1 + signals.index(ripple[0])] += ripple[1]
-    loop = close(controller, take_sliding(plant, params), params, (replace(law, b=b, d=d), signals))
+    law, signals = enclose(controller, plant, of_force=True)
+    fed = {output: way for output, way in ((REFERENCE, weight), (EFFORT, ripple)) if way is not None}
+    signals = tuple(dict.fromkeys((*signals, *(reads for reads, _ in fed.values()))))
+    names = dict(zip(signals, name_readings(len(signals)), strict=True))
+    further = [add_up(output, {names[reads]: slope}) for output, (reads, slope) in fed.items()]
+    law = law.connected(further, [REFERENCE, *names.values()])
+    loop = close(controller, take_sliding(plant, params), params, (law, signals))
     return float(np.max(np.abs(loop.eigenvalues())))
 
 

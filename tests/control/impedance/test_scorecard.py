@@ -35,7 +35,7 @@ def test_impedance_is_that_of_the_equations(controller: so.Controller) -> None:
 
 
 def test_noise_is_that_of_a_simulation(controller: so.Controller) -> None:
-    system = controller.close(STAND, THOR).system()
+    system = controller.close(STAND, THOR).system().block
     noise = np.random.default_rng(0).normal(size=100_000)
     x, effort = np.zeros(len(system.a)), np.empty(noise.size)
     for i, n in enumerate(noise):

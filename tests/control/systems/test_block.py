@@ -4,7 +4,7 @@ import control
 import numpy as np
 import pytest
 
-from seaopt.control.systems.block import Block, connect, make_delay
+from seaopt.control.systems.block import Block, add_up, connect, make_delay, subtract_last
 
 
 def draw(rng, n, inputs, outputs, direct=1.0):
@@ -56,6 +56,28 @@ def test_what_is_put_in_under_a_name_adds_to_the_outputs_of_that_name():
     )
     loop = connect([gain, unit], ["y", "u"], ["y", "u"])  # y = u + n, u = -3 y + w
     np.testing.assert_allclose(loop.d, np.array([[1.0, 1.0], [-3.0, 1.0]]) / 4.0)
+
+
+def test_in_series_no_state_is_fed_by_what_stands_behind_it_not_even_by_rounding():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        front, middle = draw(rng, 2, ("r",), ("m",), 30.0), draw(rng, 1, ("m",), ("n",), 30.0)
+        behind = draw(rng, 3, ("n", "y"), ("u",), 30.0)
+        joined = connect([behind, front, middle], ["r", "y"], ["u"])
+        assert np.array_equal(joined.a[:3, :3], behind.a)
+        assert np.array_equal(joined.c[:, :3], behind.c)
+        assert not joined.a[3:, :3].any()
+        assert not joined.a[3:5, 5:].any()
+
+
+def test_sums_and_differences_of_signals():
+    rng = np.random.default_rng(6)
+    joined = connect([subtract_last("x", "v", 0.9, 4.0), add_up("u", {"v": 2.0, "w": -3.0})], ["x", "w"], ["u"])
+    x, w, state, out = rng.normal(size=20), rng.normal(size=20), np.zeros(1), []
+    for given in zip(x, w, strict=True):
+        out.append(float((joined.c @ state + joined.d @ given)[0]))
+        state = joined.a @ state + joined.b @ given
+    np.testing.assert_allclose(out, 8.0 * (x - 0.9 * np.concatenate([[0.0], x[:-1]])) - 3.0 * w, rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("samples", [0, 1, 3])

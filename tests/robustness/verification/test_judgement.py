@@ -145,7 +145,7 @@ def test_the_force_that_noise_makes_is_the_covariance_of_the_loop(controller, st
         command_step=0.1,
     )  # fmt: skip
     view = linearise_last_phase(rig, default_scenarios(controller, stand)[0], thor)
-    system = controller.close(stand, thor).system()
+    system = controller.close(stand, thor).system().block
     read = np.outer(system.b[:, 0], system.b[:, 0]) * (4.0 + 9.0 / 12.0)
     c, d = system.c[0], (system.d[0, 0] - 1.0) ** 2 * (4.0 + 9.0 / 12.0)
     expected = c @ solve_discrete_lyapunov(system.a, read) @ c + d
