@@ -213,8 +213,8 @@ class LawFile(_Strict):
         if self.law is None:
             return Law.from_transfer_functions(fractions[0][1], [fraction for _, fraction in fractions[1:]], ts)
         remedy = "give the matrices from (reference, measured) to effort"
-        matrices = from_content(StoredLaw, self.law, f"{source}: law", remedy=remedy).build(ts)
-        law, f = Law.from_state_space(matrices.a, matrices.b, matrices.c, matrices.d, ts), COMPARED / ts
+        law = from_content(StoredLaw, self.law, f"{source}: law", remedy=remedy).build(ts).set_apart()
+        f = COMPARED / ts
         if fractions and len(fractions) != law.d.size:
             raise FileError(
                 f"{source}: measurement has {len(fractions) - 1} entries, and law reads {law.d.size - 1} signals"

@@ -239,15 +239,17 @@ class Law:
             )
         if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
             raise ControlError("law: A, B, C or D has a number that is not finite; correct it")
-        as_given = cls(a=a, b=b, c=c, d=d, sample_time_s=sample_time_s)
-        fractions = read_companion(a, b, c, d)
+        return cls(a=a, b=b, c=c, d=d, sample_time_s=sample_time_s).set_apart()
+
+    def set_apart(self) -> Law:
+        """Return the law balanced, with what integrates set apart, as `from_state_space` does."""
+        fractions = read_companion(self.a, self.b, self.c, self.d)
         if fractions:  # whose coefficients tell a root at 1 from one next to it, where eigenvalues do not
             reference, *measurements = fractions
             with suppress(ControlError):
-                return cls.from_transfer_functions(
-                    reference, [replace(path, num=-path.num) for path in measurements], sample_time_s
-                )
-        return _set_apart(as_given)
+                paths = [replace(path, num=-path.num) for path in measurements]
+                return Law.from_transfer_functions(reference, paths, self.sample_time_s)
+        return _set_apart(self)
 
     @classmethod
     def from_control(cls, system: Any) -> Law:
@@ -302,8 +304,7 @@ class Law:
         """
         inputs = list(self.block.inputs)
         speed, inputs[column] = inputs[column], READ
-        law = self.connected([subtract_last(READ, speed, gain=1.0 / self.sample_time_s)], inputs)
-        return Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
+        return self.connected([subtract_last(READ, speed, gain=1.0 / self.sample_time_s)], inputs).set_apart()
 
     def reading(self, feedback: TransferFunction) -> Law:
         """Return the law u - C(q) y that reads one signal more, in a last column of b."""

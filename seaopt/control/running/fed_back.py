@@ -142,9 +142,9 @@ def close_terms(controller: Controller, plant: Plant) -> Controller:
     """
     if not feeds_back(controller, plant):
         return controller
-    law, signals = enclose(controller, plant, of_force=True)
+    enclosed = enclose(controller, plant, of_force=True)
     kept = np.exp(-FORGOTTEN) if TURNED in plant.states else 1.0
     ways = {WEIGHT: add_up(REFERENCE, {WEIGHT: 1.0}), AGAINST: subtract_last(AGAINST, EFFORT, kept)}
     shown = [name for name in ways if name in _list_shown(controller, plant)]
-    law = law.connected([ways[name] for name in shown], [*law.block.inputs, *shown])
-    return replace(controller, law=law, reads=(*signals, *shown), compensation=None, outer=None)
+    law = enclosed.law.connected([ways[name] for name in shown], [*enclosed.law.block.inputs, *shown])
+    return replace(enclosed, law=law, reads=(*enclosed.signals, *shown), compensation=None, outer=None)

@@ -12,13 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.control import Controller
-from seaopt.control.laws.outer_run import close_outer, enclose
+from seaopt.control.laws.outer_run import enclose
 from seaopt.control.loops.moved_link import find_position, keep_share, show_position
 from seaopt.errors import LogError
 from seaopt.machine.ticks import Ticks
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import take_sliding
 
 
 def enclose_outer(controller: Controller, link: tuple[Plant, ParameterSet]) -> Controller:
@@ -30,9 +29,8 @@ def enclose_outer(controller: Controller, link: tuple[Plant, ParameterSet]) -> C
     shown = show_position(plant, outer, controller.signals)
     if find_position(shown, outer) is None:
         raise LogError(f"link: {plant.name} has no output {outer.position}; give the plant that the outer loop is of")
-    law, reads = enclose(controller, shown, of_force=True)
-    figures = close_outer(controller, take_sliding(plant, values), values).figures()
-    return replace(controller, law=law, reads=reads, outer=None, design=(shown, values), achieved=figures)
+    enclosed = enclose(controller, shown, of_force=True)
+    return replace(enclosed, design=(shown, values), achieved=enclosed.close(shown, values).figures())
 
 
 def enclose_ticks(enclosed: Controller, ticks: Ticks) -> Ticks:

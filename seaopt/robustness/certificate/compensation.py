@@ -28,7 +28,7 @@ import numpy as np
 
 from seaopt.control import Controller
 from seaopt.control.compensation.compensate import ENOUGH, find_compensation_margins
-from seaopt.control.laws.outer_run import close, enclose
+from seaopt.control.laws.outer_run import enclose
 from seaopt.control.loops.compensation.stability import CompensationMargin
 from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.systems.block import EFFORT, REFERENCE, add_up, name_readings
@@ -36,7 +36,6 @@ from seaopt.errors import ControlError
 from seaopt.executors import Shared
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import output_function
 from seaopt.progress import Progress
 from seaopt.records import record
@@ -233,13 +232,13 @@ def find_radius(
     """Return the largest eigenvalue of the sampled loop, sliding, with further feedback. `weight` feeds the reference
     by the link's position, `ripple` the effort by the motor's: each an output and a slope.
     """
-    law, signals = enclose(controller, plant, of_force=True)
+    enclosed = enclose(controller, plant, of_force=True)
     fed = {output: way for output, way in ((REFERENCE, weight), (EFFORT, ripple)) if way is not None}
-    signals = tuple(dict.fromkeys((*signals, *(reads for reads, _ in fed.values()))))
+    signals = tuple(dict.fromkeys((*enclosed.signals, *(reads for reads, _ in fed.values()))))
     names = dict(zip(signals, name_readings(len(signals)), strict=True))
     further = [add_up(output, {names[reads]: slope}) for output, (reads, slope) in fed.items()]
-    law = law.connected(further, [REFERENCE, *names.values()])
-    loop = close(controller, take_sliding(plant, params), params, (law, signals))
+    law = enclosed.law.connected(further, [REFERENCE, *names.values()])
+    loop = replace(enclosed, law=law, reads=signals).close(plant, params)
     return float(np.max(np.abs(loop.eigenvalues())))
 
 

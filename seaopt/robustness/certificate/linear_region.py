@@ -105,8 +105,7 @@ def _split_law(mpc: ForceMPC) -> Law:
     """Return the law that reads the force alone with its integrator apart: rounding leaves that pole on either side of
     the unit circle.
     """
-    law = replace(mpc, link=None).law
-    return Law.from_state_space(law.a, law.b, law.c, law.d, law.sample_time_s)
+    return replace(mpc, link=None).law.set_apart()
 
 
 def sweep_plans(plans: Iterable[ForceMPC], robust_to: RobustTo | None = None) -> Frontier:

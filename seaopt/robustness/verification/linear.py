@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from seaopt.control.laws.outer_run import close, enclose
+from seaopt.control.laws.outer_run import enclose
 from seaopt.control.loops.loop import GROWING, STABLE, Loop
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -79,8 +79,8 @@ def view_loop(rig: Rig, plant: Plant, params: ParameterSet) -> LinearView:
     controller, outer = rig.controller, rig.controller.outer
     enclosed = enclose(controller, plant)
     return LinearView(
-        loop=close(controller, plant, params, enclosed),
-        noise=tuple(_combine_std(*rig.find_errors(name)) for name in enclosed[1]),
+        loop=Loop(plant=enclosed.plant(plant, params), law=enclosed.law),
+        noise=tuple(_combine_std(*rig.find_errors(name)) for name in enclosed.signals),
         step_N=_combine_std(0.0, rig.command_step / controller.command.per_effort),
         drifts=outer is not None and not outer.stiffness,
     )

@@ -12,7 +12,7 @@ import numpy as np
 from seaopt.bench import Chirp, Excitation
 from seaopt.control import Controller
 from seaopt.control.laws.limits import BY_NAME, STEADY, STEADY_PERIODS
-from seaopt.control.laws.outer_run import close, enclose
+from seaopt.control.laws.outer_run import enclose
 from seaopt.control.laws.realisation import RunnableLaw, runnable
 from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.control.running.sampled_loop import find_longest_delay
@@ -431,7 +431,7 @@ def _lever(plant: Plant) -> str | None:
 def _size_last_phase(controller: Controller, plant: Plant) -> float:
     """Return the duration of a last phase: long enough for the loop's slowest swing, and for slow limit cycles."""
     _, params = _require_design(controller)
-    loop = close(controller, take_sliding(plant, params), params, enclose(controller, plant))
+    loop = enclose(controller, plant).close(plant, params)
     poles = np.log(loop.eigenvalues() + 1e-300) / controller.sample_time_s
     swinging = np.abs(poles.imag[np.abs(poles.imag) > np.abs(poles.real)])
     slowest = 2 * np.pi / float(np.min(swinging)) if swinging.size else 0.0

@@ -343,7 +343,7 @@ def test_an_impedance_around_it_is_the_one_integrated_here(tuned: Controller) ->
     """Stiffness and damping of the link, each sample: K (x_0 - x) less D times its filtered speed."""
     whole = add_impedance(tuned, SWING, VALUES, Impedance(stiffness=20.0, damping=1.5))
     assert whole.outer is not None
-    assert enclose(whole, SWING)[1] == (*whole.signals, "theta_l")
+    assert enclose(whole, SWING).signals == (*whole.signals, "theta_l")
     loop = SampledLoop(plant=SWING, law=runnable(whole, outer=True), measured=whole.signals, delay_samples=1)
     run = run_loop(loop, [VALUES], np.full(300, 0.2))
     _, found = simulate_by_hand(dict(tuned.gains), np.full(300, 0.2), True, (20.0, 1.5))

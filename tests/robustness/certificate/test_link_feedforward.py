@@ -307,7 +307,7 @@ def test_a_step_of_the_impedance_is_the_one_made_here(rendering: Controller) -> 
     assert abs(expected[-1] - 1.0) < 0.2
     moved = close_link(find_link(rendering, SWING, DAMPED), TS).step(ASKED, 400)
     np.testing.assert_allclose(moved, expected, atol=1e-6)
-    assert enclose(rendering, SWING)[1] == ("F1", "x_2")
+    assert enclose(rendering, SWING).signals == ("F1", "x_2")
     loop = SampledLoop(plant=SWING, law=runnable(rendering, outer=True), measured=rendering.signals, delay_samples=1)
     played = run_loop(loop, [DAMPED], np.full(400, 1e-5)).outputs["x_2"][0]
     np.testing.assert_allclose(played * 1e5, expected, atol=1e-4)
