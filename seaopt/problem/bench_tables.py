@@ -9,8 +9,9 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Strict, String
 
 from seaopt.bench import Chirp, Multisine, Noise, Sensors
 from seaopt.documents import Flag, Number, Whole
+from seaopt.estimation import Experiment
 from seaopt.logs import Counter
-from seaopt.plants import Actuation, Difference, Friction, Mode, Port, Sensing, SeriesSpring
+from seaopt.plants import Actuation, Friction, Mode, Port, Sensing, SeriesSpring
 from seaopt.problem.option_tables import Formula, Name, StrictTable, key, table_of
 
 NotNegative = Annotated[Number, Field(ge=0)]
@@ -129,10 +130,6 @@ class CounterTable(table_of(Counter)):
     """A column that counts samples; where it skips, gaps are opened."""
 
 
-class DifferenceTable(table_of(Difference)):
-    """A measured speed that a device computed from a position, sample by sample."""
-
-
 class ChirpTable(table_of(Chirp)):
     """A logarithmic chirp over the whole duration."""
 
@@ -247,8 +244,8 @@ class ResampleTable(StrictTable):
     bridge_s: Number | None = key("Longest step of time that is interpolated across.", default=None, gt=0)
 
 
-class ExperimentTable(StrictTable):
-    """One log, or one virtual experiment, of one plant."""
+class LogTable(StrictTable):
+    """A log, or a virtual one, of one plant: how it is read, and what only a file says of it."""
 
     name: Name = key("For results: letters, digits, _ and -.")
     plant: Name = key("A [plant.NAME] of this file.")
@@ -261,42 +258,24 @@ class ExperimentTable(StrictTable):
     outputs: dict[str, Header | ColumnTable] = key(
         "The plant's outputs that were measured, and their columns.", default={}
     )
-    differences: dict[str, DifferenceTable] = key("Speeds that a device computed from a position.", default={})
     align: AlignTable | None = key("How columns of other clocks are aligned to the log's.", default=None)
     window_s: tuple[Number, Number] | None = key("Read only what lies between these times.", default=None)
     counter: CounterTable | None = key("A column that counts samples, which shows lost ones.", default=None)
     duplicates: Literal["first", "mean"] | None = key("Which of several samples at one time counts.", default=None)
-    sigma: dict[str, Number] = key("Noise by output, SI; estimated where left out.", default={})
-    quantisation: dict[str, Number] = key(
-        "Step that readings are rounded to, by output, SI: an error that is uniform and follows the motion.", default={}
-    )
-    initial_state: Literal["estimate", "rest"] | dict[str, Number] = key(
-        '"estimate", "rest", or states with values.', default="estimate"
-    )
-    offset: Flag | dict[str, Number] = key(
-        "One unknown offset per output (true), none (false), or known ones.", default=True
-    )
-    parameters: dict[str, Number | UnknownTable | ColumnTable] = key(
-        "Values, or free ones, of this log alone.", default={}
-    )
-    delay_s: Number | UnknownTable = key("Delay from the input's column to its effect.", default=0.0)
-    gain: dict[str, Number | UnknownTable] = key("Gain of each output's sensor.", default={})
-    hold: Literal["zero", "first"] = key(
-        '"first" for a measured input: straight lines between its samples.', default="zero"
-    )
-    drift: Whole = key("Order of a polynomial that each output may drift by.", default=0, ge=0, le=5)
-    shots: Whole = key("Parts with initial states of their own.", default=1, ge=1, le=100_000)
     slice_s: tuple[Number, Number] | None = key("Part that is used, in seconds from the log's start.", default=None)
     resample: Literal["restamp"] | ResampleTable | None = key(
         '"restamp" for rounded timestamps; a rate for uneven ones.', default=None
     )
     decimate: Whole = key("Keep every n-th sample, behind a filter.", default=1, ge=1, le=10_000)
-    saturation: dict[str, tuple[Number, Number]] = key(
-        "Range of each sensor; samples at its ends have no weight.", default={}
+    parameters: dict[str, Number | UnknownTable | ColumnTable] = key(
+        "Values, or free ones, of this log alone.", default={}
     )
-    mask: Literal["auto", "declared", "none"] = key("Whether flat tops lose their weight.", default="auto")
-    gaps: Literal["split", "error"] = key('Cut the log at gaps, or refuse it ("error").', default="split")
-    feedback: Flag = key("Taken under a law: its input carries noise, and it judges no certificate.", default=False)
+    delay_s: Number | UnknownTable = key("Delay from the input's column to its effect.", default=0.0)
+    gain: dict[str, Number | UnknownTable] = key("Gain of each output's sensor.", default={})
+
+
+class ExperimentTable(table_of(Experiment, leave_out=frozenset(LogTable.model_fields), base=LogTable)):
+    """One log, or one virtual experiment, of one plant."""
 
 
 class AcceptanceTable(StrictTable):

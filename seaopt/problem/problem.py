@@ -320,24 +320,15 @@ class Problem:
         log = _resample(log, table).decimate(table.decimate)
         columns = {name: column for name, column in table.outputs.items() if isinstance(column, ColumnTable)}
         sigma = table.sigma | {name: column.sigma for name, column in columns.items() if column.sigma is not None}
-        return Experiment(
+        return make_record(
+            Experiment,
+            table,
             plant=plant,
             log=log,
-            name=table.name,
             outputs=_virtual_outputs(plant, table.virtual) if table.virtual else tuple(table.outputs),
             sigma=sigma,
-            quantisation=table.quantisation,
-            initial_state=table.initial_state,
-            offset=table.offset,
             gain={name: _make_unknown(name, "-", gain) for name, gain in table.gain.items()},
             delay_s=_make_unknown("delay_s", "s", table.delay_s),
-            hold=table.hold,
-            gaps=table.gaps,
-            feedback=table.feedback,
-            drift=table.drift,
-            shots=table.shots,
-            saturation=table.saturation,
-            mask=table.mask,
             parameters={name: self._make_own(plant, table, name, log) for name in table.parameters},
             differences={name: make_record(Difference, difference) for name, difference in table.differences.items()},
         )

@@ -19,6 +19,7 @@ from seaopt.logs.log.saturation import mask_saturated
 from seaopt.logs.quality.channel import BEYOND
 from seaopt.logs.quality.clock import split_rows
 from seaopt.logs.quality.faults import find_quantisation, find_runs, has_step
+from seaopt.options import check_options, option
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import follow_readings
@@ -30,80 +31,18 @@ from seaopt.simulation.simulate import input_samples
 from seaopt.units import factor, same_dimension, unit_after
 
 EXPERIMENT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
-MAX_DRIFT = 5
 SHORTEST_SHOT = 4  # samples
 BEGINNING = 64  # samples
 BRIDGED = 4  # missing samples in a row, that a line stands in for
 FEWEST_READ = 16  # samples that tell a reading's noise
 ROUGH = 0.3  # rad of a wave, that takes 4 % of it
 Mask = Literal["auto", "declared", "none"]
-# The values of a setting, and how to name them.
-CHOICES = {
-    "hold": (("zero", "first"), '"zero" or "first"'),
-    "gaps": (("split", "error"), '"split" or "error"'),
-    "mask": (("auto", "declared", "none"), '"auto", "declared" or "none"'),
-    "initial_state": (("estimate", "rest"), '"estimate", "rest" or a state-by-state mapping'),
-}
 InitialState = Literal["estimate", "rest"] | Mapping[str, float]
 
 
 @record(eq=False, repr=False, keywords=True)
 class Experiment:
     """One log of one plant.
-
-    Parameters
-    ----------
-    plant : Plant
-        The model of what was on the bench.
-    log : Log
-        Channels with the names of the plant's inputs, and of the outputs that were measured.
-    name : str
-        For results and messages.
-    outputs : tuple of str
-        Measured outputs; every output of the plant that the log has, if empty.
-    sigma : mapping of output to float
-        Standard deviation of the sensor noise, in the output's unit; estimated where left out.
-    quantisation : mapping of output to float
-        The step that a sensor's readings are rounded to, in the output's unit: the error is then uniform over a step,
-        besides white noise, and follows the motion. Where left out, steps that the log shows may make it so.
-    initial_state : "estimate", "rest" or mapping
-        Unknown in each segment; zero; or known (zero where left out).
-    offset : bool or mapping
-        One unknown offset per output; none; or known ones.
-    drift : int
-        Slow drift of the sensors: order, up to 5, of a polynomial over the log that is added to each output
-        (Legendre's, so that the offset stays the mean). 0: none.
-    gain : mapping of output to float or Parameter
-        measured = gain * output + offset + drift; 1 where left out. A free Parameter is estimated.
-    delay_s : float or Parameter
-        Of the input; a free Parameter is estimated.
-    hold : {"zero", "first"}
-        The input between samples: "zero" for a command, "first" for a measured current.
-    gaps : {"split", "error"}
-        A gap in the log starts a new segment with its own initial state, or is an error.
-    saturation : mapping of output to (low, high)
-        Ranges of the sensors: samples at an end or beyond it become missing.
-    mask : {"auto", "declared", "none"}
-        Saturated samples of outputs become missing, as `notes` states: those outside the declared ranges, and those at
-        clear flat tops where no range is declared; the declared ones alone; or none. A saturated input is what
-        the plant received.
-    shots : int
-        Cut each segment into this many shots, each with its own initial state: for a plant that diverges in
-        simulation. The information of the joints is lost.
-    parameters : mapping of name to float or Parameter
-        Parameters of the plant in this log alone, in the plant's units: a payload, a gain of the firmware. A free
-        Parameter is estimated from this log alone, and stands among the fit's parameters as EXPERIMENT.NAME.
-    differences : mapping of output to Difference
-        Measured speeds that are differences of a position over samples of this log: outputs that the plant then has
-        besides its own. What the device held before a segment's first sample is part of the initial state.
-    feedback : bool
-        The log was taken under a law that reads the outputs, so that its input carries their noise. It is fitted as
-        any other, best by errors of prediction; as a judge of a certificate's law it would be wrong, and is none.
-
-    Attributes
-    ----------
-    log_segments : tuple of slice
-        The log's samples between gaps.
 
     Raises
     ------
@@ -113,26 +52,82 @@ class Experiment:
         The log is not uniformly sampled.
     """
 
-    plant: Plant
-    log: Log
-    name: str = "experiment"
-    outputs: tuple[str, ...] = ()
-    sigma: Mapping[str, float] = field(default_factory=dict[str, float])
-    quantisation: Mapping[str, float] = field(default_factory=dict[str, float])
-    initial_state: InitialState = "estimate"
-    offset: bool | Mapping[str, float] = True
-    drift: int = 0
-    gain: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
-    delay_s: float | Parameter = 0.0
-    hold: Hold = "zero"
-    gaps: Literal["split", "error"] = "split"
-    saturation: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
-    mask: Mask = "auto"
-    shots: int = 1
-    parameters: Mapping[str, float | Parameter] = field(default_factory=dict[str, "float | Parameter"])
-    differences: Mapping[str, Difference] = field(default_factory=dict[str, Difference])
-    feedback: bool = False
-    log_segments: tuple[slice, ...] = field(init=False)
+    plant: Plant = option("The model of what was on the bench.")
+    log: Log = option("Channels with the names of the plant's inputs, and of the outputs that were measured.")
+    name: str = option("For results and messages.", default="experiment")
+    outputs: tuple[str, ...] = option(
+        "Measured outputs; every output of the plant that the log has, if empty.", default=()
+    )
+    sigma: Mapping[str, float] = option(
+        "Standard deviation of the noise by output, SI; estimated where left out.", default_factory=dict[str, float]
+    )
+    quantisation: Mapping[str, float] = option(
+        "Step that readings are rounded to, by output, SI: the error is then uniform over a step, besides white noise, "
+        "and follows the motion. Where left out, steps that the log shows may make it so.",
+        default_factory=dict[str, float],
+    )
+    initial_state: InitialState = option(
+        '"estimate": unknown in each segment; "rest": zero; or states with values, zero where left out.',
+        default="estimate",
+    )
+    offset: bool | Mapping[str, float] = option(
+        "One unknown offset per output (true), none (false), or known ones.", default=True
+    )
+    parameters: Mapping[str, float | Parameter] = option(
+        "Values, or free ones, of this log alone, in the plant's units: a payload, a gain of the firmware. A free one "
+        "stands among the fit's parameters as EXPERIMENT.NAME.",
+        default_factory=dict[str, "float | Parameter"],
+    )
+    delay_s: float | Parameter = option(
+        "Delay from the input's column to its effect; a free one is estimated.", default=0.0
+    )
+    gain: Mapping[str, float | Parameter] = option(
+        "Gain of each output's sensor, 1 where left out: measured = gain * output + offset + drift. A free one is "
+        "estimated.",
+        default_factory=dict[str, "float | Parameter"],
+    )
+    hold: Hold = option(
+        'The input between samples: "zero" for a command, "first" for a measured one, straight lines.', default="zero"
+    )
+    drift: int = option(
+        "Slow drift of the sensors: order of a polynomial over the log that is added to each output (Legendre's, so "
+        "that the offset stays the mean).",
+        default=0,
+        least=0,
+        most=5,
+    )
+    shots: int = option(
+        "Parts that each segment is cut into, with initial states of their own: for a plant that diverges in "
+        "simulation. The information of the joints is lost.",
+        default=1,
+        least=1,
+        most=100_000,
+    )
+    saturation: Mapping[str, tuple[float, float]] = option(
+        "Range of each sensor: samples at its ends or beyond become missing.",
+        default_factory=dict[str, tuple[float, float]],
+    )
+    mask: Mask = option(
+        'Which saturated samples of outputs become missing, as `notes` states. "auto": those outside the declared '
+        'ranges, and those at clear flat tops where no range is declared; "declared": the former alone. A saturated '
+        "input is what the plant received.",
+        default="auto",
+    )
+    gaps: Literal["split", "error"] = option(
+        '"split": a gap in the log starts a new segment with its own initial state; "error": it is refused.',
+        default="split",
+    )
+    differences: Mapping[str, Difference] = option(
+        "Measured speeds that are differences of a position over samples of this log: outputs that the plant then has "
+        "besides its own. What the device held before a segment's first sample is part of the initial state.",
+        default_factory=dict[str, Difference],
+    )
+    feedback: bool = option(
+        "Taken under a law that reads the outputs: the input carries their noise. Such a log is fitted as any other, "
+        "best by errors of prediction, and judges no certificate.",
+        default=False,
+    )
+    log_segments: tuple[slice, ...] = field(init=False)  # the log's samples between gaps
 
     def __post_init__(self) -> None:
         for value, kind, what, remedy in (
@@ -302,19 +297,14 @@ class Experiment:
                 raise self._refuse(f'{what} names "{name}", which is not {kind}; {suggestion(name, choices)}')
 
     def _check_settings(self) -> None:
-        label = f"experiment {self.name}:"
         self._check_each_output()
         if isinstance(self.initial_state, Mapping):
             self._check_names("initial_state", self.initial_state, self.plant.states, f"a state of {self.plant.name}")
-        for what, (choices, use) in CHOICES.items():
-            value = getattr(self, what)
-            if what == "initial_state" and isinstance(value, Mapping):
-                continue
-            require_type(value, str, f"{label} {what}", f"give {use}", EstimationError)
-            if value not in choices:
-                raise self._refuse(f'{what} = "{value}" is not known; use {use}')
-        if isinstance(self.drift, bool) or not isinstance(self.drift, int) or not 0 <= self.drift <= MAX_DRIFT:
-            raise self._refuse(f"drift = {self.drift!r} is not the order of a polynomial; give 0 (none) to {MAX_DRIFT}")
+        elif self.initial_state not in ("estimate", "rest"):
+            raise self._refuse(
+                f'initial_state = {self.initial_state!r} is not known; give "estimate", "rest" or values by state'
+            )
+        check_options(self, EstimationError, f"experiment {self.name}: ")
         delay = self.delay_s
         if isinstance(delay, Parameter):
             delay = delay.value * (factor(delay.unit, "s") if same_dimension(delay.unit, "s") else 1.0)
@@ -324,8 +314,6 @@ class Experiment:
             raise self._refuse(
                 f"delay_s = {delay:g} is longer than its log of {self.log.duration_s:.4g} s; give fewer seconds"
             )
-        if isinstance(self.shots, bool) or not isinstance(self.shots, int) or self.shots < 1:
-            raise self._refuse(f"shots = {self.shots!r}; give 1 or more")
         if self.gaps == "error" and len(self.log_segments) > 1:
             raise self._refuse(
                 f'the log has {format_count(len(self.log_segments) - 1, "gap")} and gaps = "error"; use '
