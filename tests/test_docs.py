@@ -259,7 +259,7 @@ def test_the_tables_of_a_page_are_toml(page):
 
 def list_commands():
     """Return the lines of every page that call seaopt, without their comments."""
-    for page in list_pages():
+    for page in (*list_pages(), "../README.md"):
         for text in blocks(page, "sh"):
             for line in text.replace("\\\n", " ").splitlines():
                 words = shlex.split(line, comments=True)
