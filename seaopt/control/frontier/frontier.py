@@ -23,7 +23,7 @@ from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.tuning.found_law import FoundLaw, Surround, meet_outer
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import Task
-from seaopt.control.tuning.solution import feed_link, lower_fraction, search, solve
+from seaopt.control.tuning.solution import feed_link, lower_fraction, search, solve, solve_beside
 from seaopt.control.tuning.tuner import Draws, RobustTo, aim_task, make_controller, make_task, name_design
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
@@ -212,7 +212,7 @@ def _solve_chain(swept: _SweepTask, chain: Sequence[ControllerSpec], progress: P
     for point, part in zip(chain, divide(progress, *(1.0 for _ in chain)), strict=True):
         whole, sliding_alone = divide(prefix(part, f"{point.bandwidth_hz:g} Hz"), 1.0, float(swept.sticks))
         task = aim_task(swept.task, point)
-        task, x, loops = lower_fraction(task, *solve(task, warm, whole))
+        task, x, loops = lower_fraction(task, *solve_beside(task, warm, whole))
         x, loops = search(task, x, loops)
         if swept.outer is not None:
             found = meet_outer(FoundLaw(task=task, x=x, loops=loops), swept.describe, swept.outer, ignore)

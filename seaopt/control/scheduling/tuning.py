@@ -55,6 +55,7 @@ from seaopt.plants.plant import require_plant
 from seaopt.progress import Progress, count_off, divide, ignore
 from seaopt.records import record
 
+SLOWEST_OBSERVER_S = 3.0  # beside integrals a slower one costs a law that is frozen at a place too many digits
 ANOTHER_VALLEY = 10.0  # factor by which an integral's rate differs between two of the tuner's valleys
 Chain = list[Solution]  # of every point
 
@@ -277,7 +278,7 @@ def _share_nominal(task: Task, other: Task) -> Task:
     if task.nominal is None or other.nominal is None:
         return task
     gain = other.nominal.inverse_gain * task.nominal.static_inverse / other.nominal.static_inverse
-    return replace(task, nominal=other.nominal.scaled(gain))
+    return replace(task, nominal=other.nominal.scaled(gain), slowest_observer_s=SLOWEST_OBSERVER_S)
 
 
 def _rank_chains(tasks: Sequence[Task], followed: Chain | None, progress: Progress) -> list[Chain]:

@@ -24,7 +24,7 @@ from seaopt.control.tuning.solution import (
     measure_missed,
     retry,
     search,
-    solve,
+    solve_beside,
     solve_near,
 )
 from seaopt.errors import ControlError, SeaoptError
@@ -143,7 +143,7 @@ def find_law(task: Task, warm: Sequence[LawNumbers], progress: Progress) -> Foun
     """Return the best law of a task, and where it misses a limit what is possible instead."""
     first = SOLUTION * (8.0 if task.asks_margin else 1.0)
     solving, seeking, easing = divide(progress, first, BANDWIDTHS, EASING)
-    x, loops = solve(task, warm, progress=solving)
+    x, loops = solve_beside(task, warm, progress=solving)
     task, x, loops = lower_fraction(task, x, loops)
     if not task.eased:
         x, loops = search(task, x, loops)

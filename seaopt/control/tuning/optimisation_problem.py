@@ -118,7 +118,6 @@ NO_FLOOR = 1e-9
 NO_FLOOR_FILTERED = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
 NEARLY_KEPT = 1.001
 NEXT_TO_NO_NOISE = 1e-9  # N/N, of a law without feedback: the objective's logarithm is taken
-SLOWEST_OBSERVER_S = 3.0  # slower, double-precision coefficients say too little of Q at 1e-3 Hz
 LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
 LOWEST_PREFILTER = 0.3  # of the bandwidth
 PREFILTER_DAMPING = (0.4, 2.0)
@@ -162,6 +161,7 @@ class Task:
     moved: MovedLinks | None = None
     eased: Mapping[str, float] = field(default_factory=dict[str, float])
     settles: bool = True
+    slowest_observer_s: float = 30.0  # where the objective begins, 0.1 Hz, Q is 0.003: it does nothing
 
     @property
     def speed_loop(self) -> SpeedLoop | None:
@@ -282,7 +282,7 @@ class Task:
             free if spec.reference_weights != "error" else fixed,
             free if self.speed_loop is not None else fixed,
             (fastest, max(fastest, 4.0 / (2 * np.pi * spec.bandwidth_hz))),
-            (0.2 * ts, SLOWEST_OBSERVER_S) if self.nominal is not None else unused,
+            (0.2 * ts, self.slowest_observer_s) if self.nominal is not None else unused,
             (SLOWEST_SPEED_RATE, 1.0 / ts) if self.speed_loop is not None and x[SPEED_RATE] > 0.0 else fixed,
             *notch, *prefilter,
         ]  # fmt: skip
