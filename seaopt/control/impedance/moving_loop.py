@@ -15,8 +15,8 @@ from jaxtyping import Complex, Float
 
 from seaopt.control.impedance.link import ControlledLink, Load
 from seaopt.control.loops.outer_loop import POSITION, SPEED, Impedance, OuterLoop
-from seaopt.control.loops.sampled_plant import hold
-from seaopt.control.systems.block import REFERENCE, Block, connect, make_plant
+from seaopt.control.loops.sampled_plant import sample_matrices
+from seaopt.control.systems.block import REFERENCE, Block, connect
 from seaopt.records import record
 
 
@@ -63,7 +63,7 @@ class MovingLoop:
 def close_link(link: ControlledLink, velocity_filter_s: float, load: Load | None = None) -> MovingLoop:
     """Return the loop of a link with an outer loop against `load`, which includes the link; the link alone if None."""
     load = link.load if load is None else load
-    port, period = link.port, link.sample_time_s
+    port = link.port
     # F_e = -(m - m_0) v' - d v - k x, m_0 being the probe's inertia, and v' = a x + b u + force F_e.
     share = 1.0 / (1.0 + (load.inertia - port.mass) * port.force[port.speed])
     taken = -share * ((load.inertia - port.mass) * port.a[port.speed])
@@ -72,9 +72,7 @@ def close_link(link: ControlledLink, velocity_filter_s: float, load: Load | None
     pushed = -share * (load.inertia - port.mass) * port.motor[port.speed]
     a, b, c, d = port.load(taken, pushed)
     rows, direct = np.vstack([c, np.eye(1, port.motor.size, k=port.position)]), np.append(d, 0.0)
-    sampled = hold(a[None], b[None], rows[None], direct[None], period, np.array([port.delay_s]))
-    a, b, c, d = (part[0] for part in sampled)
-    plant, outer = make_plant(a, b, c, d, link.delay_samples), link.speed_filter(velocity_filter_s)
-    plant = replace(plant, outputs=(*plant.outputs[:-1], POSITION))
+    plant = sample_matrices((a, b, rows, direct), port.delay_s, link.sample_time_s, link.delay_samples).block
+    plant, outer = replace(plant, outputs=(*plant.outputs[:-1], POSITION)), link.speed_filter(velocity_filter_s)
     blocks = [plant, link.law.block, outer.filter_speed()]
     return MovingLoop(block=connect(blocks, [REFERENCE], [POSITION, SPEED]), outer=outer)

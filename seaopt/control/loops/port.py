@@ -11,7 +11,7 @@ from seaopt.control.loops.sampled_plant import (
     find_delay,
     find_rows,
     read_conditions,
-    sample_linear,
+    sample_matrices,
 )
 from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.control.systems.resolvent import Resolvent
@@ -104,9 +104,8 @@ class PortModel:
         moving = np.arange(b.size) != self.speed  # states that cannot move are left out
         while np.any(still := moving & ~np.any(a[:, moving], axis=1) & (b == 0.0)):
             moving &= ~still
-        linear = a[moving][:, moving][None], b[moving][None], c[:, moving][None], d[None]
-        (plant,) = sample_linear(linear, np.array([self.delay_s]), sample_time_s, delay_samples)
-        return plant
+        linear = a[moving][:, moving], b[moving], c[:, moving], d
+        return sample_matrices(linear, self.delay_s, sample_time_s, delay_samples)
 
     def find_poles(self) -> ComplexN:
         """Return the poles with link 2 at rest (rad/s)."""

@@ -160,6 +160,12 @@ def sample_linear(
     ]
 
 
+def sample_matrices(linear: Sequence[Any], delay_s: float, sample_time_s: float, delay_samples: int) -> DigitalPlant:
+    """Return the digital plant of the matrices of one linear one."""
+    a, b, c, d = (part[None] for part in linear)
+    return sample_linear((a, b, c, d), np.array([delay_s]), sample_time_s, delay_samples)[0]
+
+
 def static_gain(plant: Plant, params: CompletedParameters, output: str) -> float:
     """Return an output of a constant unit of the first input, linearised at rest; infinite where it integrates.
     Bristles slide, which at rest carry a part of the input. Raises ControlError: the plant has no such output, or

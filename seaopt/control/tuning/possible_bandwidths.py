@@ -24,7 +24,7 @@ from dataclasses import replace
 import numpy as np
 
 from seaopt.control.laws.verdict import PossibleBandwidths
-from seaopt.control.loops.sampled_plant import sample_linear
+from seaopt.control.loops.sampled_plant import sample_matrices
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import ENCIRCLES, Evolution
 from seaopt.control.tuning.frequencies import count_growing, make_grid, place_frequencies
@@ -210,8 +210,7 @@ def _ease_fall(sliding: PlantWithFriction, share: float) -> PlantWithFriction:
     loop, left = sliding.loop, (1.0 - share) * np.minimum(sliding.flattest, 0.0)
     a = loop.a + (loop.friction * left) @ loop.velocity
     c = loop.sensed + (loop.through * left) @ loop.velocity
-    linear = (a[None], loop.motor[None], c[None], loop.plant.d[None])
-    delay_s = np.array([loop.delay_s])
-    (plant,) = sample_linear(linear, delay_s, loop.plant.sample_time_s, loop.plant.delay_samples)
+    timing = loop.delay_s, loop.plant.sample_time_s, loop.plant.delay_samples
+    plant = sample_matrices((a, loop.motor, c, loop.plant.d), *timing)
     eased = replace(loop, a=a, sensed=c, slopes=loop.slopes + left, plant=plant)
     return replace(sliding, loop=eased, flattest=sliding.flattest - left)

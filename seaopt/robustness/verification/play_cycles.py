@@ -23,7 +23,7 @@ from jaxtyping import Float
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction import LimitCycle
 from seaopt.control.loops.loop import Loop
-from seaopt.control.loops.sampled_plant import find_rows, hold
+from seaopt.control.loops.sampled_plant import find_rows, sample_matrices
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, jacobians
 from seaopt.plants.friction import take_sliding
@@ -89,9 +89,7 @@ def _find_plays(controller: Controller, plant: Plant, params: CompletedParameter
 
 def _predict(controller: Controller, loop: Loop, play: _Play) -> list[LimitCycle]:
     def find_pole(share: float) -> complex:
-        a, b, c, d = (np.array(block)[None] for block in play.mix(share))
-        a, b, c, d = hold(a, b, c, d, controller.sample_time_s, np.zeros(1))
-        chosen = replace(loop.plant, a=a[0], b=b[0], c=c[0], d=d[0])
+        chosen = sample_matrices(play.mix(share), 0.0, controller.sample_time_s, loop.plant.delay_samples)
         poles = replace(loop, plant=chosen).eigenvalues()
         swinging = poles[np.abs(np.imag(poles)) > 0.0]
         return complex(swinging[np.argmax(np.abs(swinging))]) if swinging.size else 0j

@@ -58,7 +58,7 @@ from seaopt.control.loops.absolute_stability import (
     refine_angles,
 )
 from seaopt.control.loops.friction_loop import FrictionLoop
-from seaopt.control.loops.sampled_plant import sample_linear
+from seaopt.control.loops.sampled_plant import sample_matrices
 from seaopt.records import record
 
 AtAngles = Complex[np.ndarray, " m"]
@@ -91,8 +91,7 @@ class SpeedReading:
         a, b = np.zeros((n + 1, n + 1)), np.append(loop.motor, 0.0)
         a[:n, :n], a[n, :n] = loop.a, self.velocity
         row = np.eye(1, n + 1, k=n) if self.differenced else np.append(self.velocity, 0.0)[None]
-        linear, late = (a[None], b[None], row[None], np.zeros((1, 1))), np.array([loop.delay_s])
-        (plant,) = sample_linear(linear, late, period, loop.plant.delay_samples)
+        plant = sample_matrices((a, b, row, np.zeros(1)), loop.delay_s, period, loop.plant.delay_samples)
         scale = -np.expm1(-1j * theta) / period if self.differenced else 1.0
         return plant.response(theta / (2 * np.pi * period)) * scale
 
