@@ -437,5 +437,7 @@ def test_a_reference_of_coarse_steps_that_allows_any_law_explains_nothing(contro
 
 def test_a_law_designed_on_a_response_has_its_log_as_an_experiment_of_the_plant_that_was_measured(controller, bench):
     law = replace(controller, design=None, measured_on=controller.design)
-    ((plant, _),) = so.accept(law, [bench.log(Machine(), REFERENCE)]).experiments
+    result = so.accept(law, [bench.log(Machine(), 0.1 * REFERENCE)])
+    ((plant, _),) = result.experiments
     assert plant is controller.design[0]
+    assert result.differences is None and "compared with no model" in " ".join(repr(result).split())

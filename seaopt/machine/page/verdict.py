@@ -36,6 +36,7 @@ LARGER = (
     "a larger amplitude, beside which dry friction is less (it is another one than in the model, which more periods do "
     "not change; or fit again with this log, and tune)"
 )
+NO_MODEL = "the machine was compared with no model, since the law was designed on none"
 UNCERTIFIED = {
     "missing": "not certified: there is no certificate of this law",
     "failed": "not certified: the certificate of this law FAILED",
@@ -70,6 +71,8 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
         reasons += [Reason(what=_say_refuted(row)) for row in limited if row.outcome == "refuted"]
         if counts["undecided"]:
             undecided = [Reason(what=f"the log does not decide {say_undecided(result, response)}")]
+    if response is not None and differences is None:
+        parts.append(NO_MODEL)
     if differences is not None and not differences.inside:
         parts.append(say_inside(result, differences))
         first = response is not None and response.rate != 1.0  # by which all figures are other ones
