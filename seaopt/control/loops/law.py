@@ -46,8 +46,7 @@ from seaopt.control.loops.transfer_function import Frequencies, Response, Transf
 from seaopt.control.systems.block import (
     COMMAND,
     EFFORT,
-    GIVEN,
-    READ,
+    OUTSIDE,
     REFERENCE,
     Block,
     connect,
@@ -303,16 +302,16 @@ class Law:
         sample. As a part of the law that is in every figure and every simulation.
         """
         inputs = list(self.block.inputs)
-        speed, inputs[column] = inputs[column], READ
-        return self.connected([subtract_last(READ, speed, gain=1.0 / self.sample_time_s)], inputs).set_apart()
+        speed, inputs[column] = inputs[column], OUTSIDE
+        return self.connected([subtract_last(OUTSIDE, speed, gain=1.0 / self.sample_time_s)], inputs).set_apart()
 
     def reading(self, feedback: TransferFunction) -> Law:
         """Return the law u - C(q) y that reads one signal more, in a last column of b."""
-        return self.connected([feedback.block(READ, EFFORT, -1.0)], [*self.block.inputs, READ])
+        return self.connected([feedback.block(OUTSIDE, EFFORT, -1.0)], [*self.block.inputs, OUTSIDE])
 
     def behind(self, part: TransferFunction) -> Law:
         """Return the law whose reference is behind a filter."""
-        return self.connected([part.block(GIVEN, REFERENCE)], [GIVEN, *self.block.inputs[1:]])
+        return self.connected([part.block(OUTSIDE, REFERENCE)], [OUTSIDE, *self.block.inputs[1:]])
 
     def scaled(self, factor: float) -> Law:
         """Return the law with its output times a factor; the chain is read as before."""
@@ -435,17 +434,6 @@ def _factorise(law: Law) -> tuple[int, Resolvent]:
     """Return how many states integrate, and the resolvent of the remainder from output to inputs, once for a law."""
     a, b, c = law.remainder
     return law.integrators, Resolvent.of(a.T, c[:, None], b.T)
-
-
-def make_static_law(gain: float, sample_time_s: float, measured: int = 1) -> Law:
-    """Return the law that feeds back a gain of the error and nothing else, of so many signals."""
-    return Law(
-        a=np.zeros((0, 0)),
-        b=np.zeros((0, 1 + measured)),
-        c=np.zeros(0),
-        d=np.array([gain, -gain] + [0.0] * (measured - 1)),
-        sample_time_s=sample_time_s,
-    )
 
 
 def count_filter_samples(law: Law) -> float:

@@ -31,7 +31,7 @@ from seaopt.control.loops.measured.plant import MeasuredPlant
 from seaopt.control.loops.outer_loop import POSITION, SPEED, OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant, sample
 from seaopt.control.loops.transfer_function import Frequencies, Response
-from seaopt.control.systems.block import GIVEN, REFERENCE, add_up
+from seaopt.control.systems.block import OUTSIDE, REFERENCE, add_up
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
 from seaopt.records import record
@@ -82,8 +82,8 @@ def enclose_law(
     position = POSITION if signal is None else readings[signal]
     stiffness, damping, _, _ = outer.numbers
     per_given = 1.0 if of_force else outer.per_given
-    asked = add_up(REFERENCE, {GIVEN: per_given, position: -stiffness, SPEED: -damping})
-    inputs = [GIVEN, *readings, *[POSITION] * (signal is None)]
+    asked = add_up(REFERENCE, {OUTSIDE: per_given, position: -stiffness, SPEED: -damping})
+    inputs = [OUTSIDE, *readings, *[POSITION] * (signal is None)]
     return law.connected([outer.filter_speed(position, kept), asked], inputs)
 
 

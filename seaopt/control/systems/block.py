@@ -28,7 +28,7 @@ Matrix = Float[np.ndarray, "... _ _"]
 
 REFERENCE, EFFORT, COMMAND = "reference", "effort", "command"
 LATE = "late command"  # as it reaches the plant
-GIVEN, READ = "given", "read"  # what a law's reference is made of, and what it reads besides
+OUTSIDE = "outside"  # what comes in place of a signal that a law takes, or beside them
 
 
 @record(eq=False)
@@ -45,8 +45,9 @@ class Block:
 
 def add_up(output: str, gains: Mapping[str, float]) -> Block:
     """Return a signal that is a sum of others, each times a gain."""
-    none, d = np.zeros((0, 0)), np.array([list(gains.values())])
-    return Block(a=none, b=np.zeros((0, d.size)), c=none.T.reshape(1, 0), d=d, inputs=tuple(gains), outputs=(output,))
+    d = np.array([list(gains.values())])
+    a, b, c = np.zeros((0, 0)), np.zeros((0, d.size)), np.zeros((1, 0))
+    return Block(a=a, b=b, c=c, d=d, inputs=tuple(gains), outputs=(output,))
 
 
 def subtract_last(read: str, output: str, kept: float = 1.0, gain: float = 1.0) -> Block:

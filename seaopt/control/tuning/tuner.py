@@ -35,7 +35,7 @@ from seaopt.control.loops.compensation.link_feedforward import (
     name_link_signal,
 )
 from seaopt.control.loops.friction_loop import make_friction_loops
-from seaopt.control.loops.law import Law, make_static_law
+from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import DiscLoop, measure_all_discs
 from seaopt.control.loops.measured.plant import MeasuredPlant
@@ -51,6 +51,7 @@ from seaopt.control.loops.sampled_plant import (
     sample,
 )
 from seaopt.control.loops.transfer_function import TransferFunction
+from seaopt.control.systems.block import EFFORT, REFERENCE, add_up
 from seaopt.control.tuning.feasibility import check_current, check_delay
 from seaopt.control.tuning.found_law import FoundLaw, Surround, find_law, find_near, meet_outer
 from seaopt.control.tuning.frequencies import count_growing
@@ -410,13 +411,13 @@ def _find_friction(
     """Return the plants of which a friction margin is required, and those that grow as they slide. `whole`: of a plant
     that slides the one with friction. `before`: how many of the task's `plants` precede the pairs.
     """
-    slope, open_law = spec.level(FRICTION), make_static_law(0.0, spec.sample_time_s, len(signals))
-    frictions: list[PlantWithFriction] = []
+    nothing = Law.of(add_up(EFFORT, dict.fromkeys((REFERENCE, *signals), 0.0)), spec.sample_time_s)
+    slope, frictions = spec.level(FRICTION), list[PlantWithFriction]()
     for number, (model, values) in enumerate(pairs, start=before):
         if model not in whole or (slope is None and not count_growing(plants[number])):
             continue
         plant = whole[model]
-        (loop,) = make_friction_loops(plant, [values], signals, gain, spec.loop_delay_samples, open_law)
+        (loop,) = make_friction_loops(plant, [values], signals, gain, spec.loop_delay_samples, nothing)
         if loop is None:
             continue
         if slope is not None and loop.obstacle:
