@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from seaopt.parameters import Parameter
 from seaopt.plants import rotary, thor
@@ -42,8 +43,17 @@ class ParameterLine:
 
     name: str
     number: float
-    value: str  # as it is written: the number, or a table with it
     comment: str
+    prior_std: float | None = None
+    bounds: Mapping[str, float] | None = None  # of one that is fitted; empty without any
+
+    @property
+    def value(self) -> str:
+        """It as it is written: the number, or a table with it."""
+        number, keys = f"{self.number:.10g}", [] if self.prior_std is None else [f"prior_std = {self.prior_std:.3g}"]
+        if self.bounds is not None:
+            keys += ["free = true", *(f"{key} = {end:.10g}" for key, end in self.bounds.items())]
+        return f"{{ value = {number}, {', '.join(keys)} }}" if keys else number
 
 
 @record
@@ -87,19 +97,18 @@ class _ParameterLines:
         """Return the number of a line that is there."""
         return next(line.number for line in self.lines if line.name == name)
 
-    def add(self, name: str, number: float, more: str = "", mark: str = "") -> None:
-        """Add a line: a number alone, or a table with `more` than that."""
+    def add(self, name: str, number: float, mark: str = "", **more: Any) -> None:
+        """Add a line; `more` are further fields of `ParameterLine`."""
         parameter = self.defaults[name]
         about = ", ".join(text for text in (parameter.description, unit_after(parameter.unit).strip("- ")) if text)
         comment = "; ".join(
             filter(None, (about, self.interview.mark(mark or name), self.interview.list_doubts().get(name)))
         )
-        value = f"{{ value = {number:.10g}, {more} }}" if more else f"{number:.10g}"
-        self.lines.append(ParameterLine(name=name, number=number, value=value, comment=comment))
+        self.lines.append(ParameterLine(name=name, number=number, comment=comment, **more))
 
     def free(self, name: str, start: float | None = None, **bounds: float) -> None:
         value = self.defaults[name].value if start is None else start
-        self.add(name, value, ", ".join(["free = true", *(f"{key} = {end:.10g}" for key, end in bounds.items())]))
+        self.add(name, value, bounds=bounds)
 
     def require(
         self, name: str, label: str, guess: float | None = None, why: str = "a typical value", *, meaning: str = ""
@@ -115,7 +124,7 @@ class _ParameterLines:
         """Ask for a value that the logs may tell: known, it is a prior; unknown, free if they tell, else a guess."""
         value = self.optional(name, label, "it is fitted" if identified else why)
         if value is not None:
-            self.add(name, value, f"prior_std = {PRIOR * value:.3g}")
+            self.add(name, value, prior_std=PRIOR * value)
         elif identified:
             self.free(name)
         else:

@@ -30,7 +30,7 @@ RETUNE = 4
 COMMENT_AT = 56  # column of the comments
 HALF = "_half"  # at the end of the name of a log at half the amplitude
 
-Row = tuple[str, str]  # a line, and its comment
+Rows = dict[str, tuple[str, str]]  # values with their comments, by key
 
 
 def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Proposed, interview: Interview) -> str:
@@ -43,7 +43,7 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
     lines = [
         "",
         _comment("[parameters]", "SI units; free = true is fitted"),
-        *_align([(f"{line.name} = {line.value}", line.comment) for line in actuator.lines]),
+        *_align({line.name: (line.value, line.comment) for line in actuator.lines}),
     ]
     sticks = any(log.traits.standing for log in logs)
     if sticks:
@@ -83,35 +83,36 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
     return "\n".join([*head, *lines]) + "\n"
 
 
-def _write_experiment(rows: Sequence[Row], keys: Sequence[str], channels: Mapping[str, Sequence[Row]]) -> list[str]:
+def _write_experiment(rows: Rows, keys: Sequence[str], channels: Mapping[str, Rows]) -> list[str]:
     """Return the lines of an experiment; `keys` are lines that stand behind the first rows."""
     tables = [line for table, each in channels.items() for line in (f"[experiment.{table}]", *_align(each))]
     return ["[[experiment]]", *_align(rows), *keys, *tables]
 
 
-def _describe_channels(log: DescribedLog, actuator: Proposed, interview: Interview) -> dict[str, list[Row]]:
+def _describe_channels(log: DescribedLog, actuator: Proposed, interview: Interview) -> dict[str, Rows]:
     """Return the entries of a log's channels by table."""
     tables = {"inputs": (log.roles.input,), "outputs": log.outputs}
     return {
-        table: [_describe_channel(log, role, actuator, interview) for role in roles] for table, roles in tables.items()
+        table: dict(_describe_channel(log, role, actuator, interview) for role in roles)
+        for table, roles in tables.items()
     }
 
 
 def _offer_second_log(
-    log: DescribedLog, name: str, rows: Sequence[Row], channels: Mapping[str, Sequence[Row]], keys: Sequence[str]
+    log: DescribedLog, name: str, rows: Rows, channels: Mapping[str, Rows], keys: Sequence[str]
 ) -> list[str]:
     """Return lines, to be taken in by hand, of a second log that shows what the model lacks."""
     stem, dot, suffix = log.file.rpartition(".")
-    second = {"name": f"{name}{HALF}", "log": f"{stem}{HALF}{dot}{suffix}" if dot else f"{log.file}{HALF}"}
-    texts = {text.split(" = ", 1)[0]: text for text, _ in rows}
-    texts |= {key: f"{key} = {format_toml(value)}" for key, value in second.items()} | {"use": 'use = "validate"'}
-    bare = {table: [(text, "") for text, _ in each] for table, each in channels.items()}
+    file = f"{stem}{HALF}{dot}{suffix}" if dot else f"{log.file}{HALF}"
+    second = {"name": f"{name}{HALF}", "log": file, "use": "validate"}
+    rows = rows | {key: (format_toml(value), "") for key, value in second.items()}
+    bare_rows, *bare = [{key: (value, "") for key, (value, _) in each.items()} for each in (rows, *channels.values())]
     return [
         "",
         "# Record the same test once more at half the amplitude, and uncomment these lines. Where the model lacks",
         "# friction, play or a motor that saturates, its parameters fit one amplitude and miss the other, and one",
         "# amplitude alone hides that.",
-        *(f"# {line}" for line in _write_experiment([(text, "") for text in texts.values()], keys, bare)),
+        *(f"# {line}" for line in _write_experiment(bare_rows, keys, dict(zip(channels, bare, strict=True)))),
     ]
 
 
@@ -164,30 +165,31 @@ def _number_names(name: str) -> Iterator[str]:
     yield from (f"{name}_{number}" for number in count(2))
 
 
-def _describe_experiment(log: DescribedLog, name: str, interview: Interview) -> list[tuple[str, str]]:
-    rows = [
-        (f"name = {format_toml(name)}", ""),
-        (f"plant = {format_toml(log.plant)}", interview.mark(f"link:{log.survey.name}")),
-        (f"log = {format_toml(log.file)}", "relative to this file"),
-    ]
+def _describe_experiment(log: DescribedLog, name: str, interview: Interview) -> Rows:
+    rows = {
+        "name": (format_toml(name), ""),
+        "plant": (format_toml(log.plant), interview.mark(f"link:{log.survey.name}")),
+        "log": (format_toml(log.file), "relative to this file"),
+    }
     clock = log.survey.clock
     if clock is None:
-        rows.append((f"rate_hz = {log.rate_hz:.10g}", interview.mark(f"rate:{log.survey.name}")))
+        rows["rate_hz"] = f"{log.rate_hz:.10g}", interview.mark(f"rate:{log.survey.name}")
     else:
         marks = [interview.mark(f"unit:{clock.name}"), _mark_role(clock.name, doubt_clock(log.survey), interview)]
-        text = f"time = {_spell_column(clock.name, log.time_unit, 1.0)}"
-        rows.append((text, "; ".join(filter(None, marks))))
+        rows["time"] = _spell_column(clock.name, log.time_unit, 1.0), "; ".join(filter(None, marks))
     if log.roles.columns[log.roles.input].header.measured:
-        rows.append(('hold = "first"', "the input was measured: straight lines between its samples"))
+        rows["hold"] = '"first"', "the input was measured: straight lines between its samples"
     if log.survey.overlap_s is not None:
         low, high = log.survey.overlap_s
         window = [math.ceil(1e6 * low) / 1e6, math.floor(1e6 * high) / 1e6]
-        rows.append((f"window_s = {format_toml(window)}", "the times that all clocks have"))
-    return rows + _describe_clock(log)
+        rows["window_s"] = format_toml(window), "the times that all clocks have"
+    return rows | _describe_clock(log)
 
 
-def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, interview: Interview) -> tuple[str, str]:
-    """Return a channel's entry, and what of it is a guess."""
+def _describe_channel(
+    log: DescribedLog, role: str, actuator: Proposed, interview: Interview
+) -> tuple[str, tuple[str, str]]:
+    """Return a channel's name, and its entry with what of it is a guess."""
     column, unit, scale = log.roles.columns[role], log.units[role], log.scales.get(role, 1.0)
     name, notes = {"torque": "I", "screw": "q"}.get(role, role), [DESCRIPTIONS[role]]
     guesses = [interview.mark(f"unit:{column.name}", f"counts:{column.name}", f"duty:{column.name}")]
@@ -207,7 +209,7 @@ def _describe_channel(log: DescribedLog, role: str, actuator: Proposed, intervie
     smooth = column.fast if role != log.roles.input else column.header.measured
     rule = "linear" if smooth else "readings" if role != log.roles.input else "hold"
     keys = _spell_clock(column, log, rule) if column.clock else {}
-    return f"{name} = {_spell_column(column.name, unit, scale, keys)}", "; ".join([*notes, *filter(None, guesses)])
+    return name, (_spell_column(column.name, unit, scale, keys), "; ".join([*notes, *filter(None, guesses)]))
 
 
 def _spell_clock(column: SurveyedColumn, log: DescribedLog, rule: str) -> dict[str, object]:
@@ -234,68 +236,59 @@ def reads_output(log: DescribedLog) -> bool:
     return share > FOLLOWS and 1.0 / GEARED[0] < slope < GEARED[0]
 
 
-def _describe_clock(log: DescribedLog) -> list[tuple[str, str]]:
+def _describe_clock(log: DescribedLog) -> Rows:
     """Return what the log's clock needs before it can be fitted."""
-    clock, rows = log.clock, list[tuple[str, str]]()
+    clock, rows = log.clock, Rows()
     if clock is None:
         return rows
     if clock.repeated.size:
-        rows.append(('duplicates = "first"', f"{clock.repeated.size} times occur twice"))
-    driver = log.roles.columns.get(log.roles.input)
+        rows["duplicates"] = '"first"', f"{clock.repeated.size} times occur twice"
+    driver, rate = log.roles.columns.get(log.roles.input), float(f"{clock.rate_hz:.3g}")
     hole = 0 if driver is None else driver.hole
     if hole:
-        rate = float(f"{clock.rate_hz:.3g}")
-        settings = (
-            f"rate_hz = {rate:.10g}, bridge_s = {max(hole + 1.5, BRIDGE) / rate:.3g}, rule = {{ readings = {{}} }}"
-        )
-        rows.append((f"resample = {{ {settings} }}", "the input is in some rows only, with the others between them"))
+        bridge = f"bridge_s = {max(hole + 1.5, BRIDGE) / rate:.3g}"
+        settings = f"{{ rate_hz = {rate:.10g}, {bridge}, rule = {{ readings = {{}} }} }}"
+        rows["resample"] = settings, "the input is in some rows only, with the others between them"
     elif clock.jitter_max > JITTER_LIMIT * clock.period:
-        if clock.rounded_only:
-            rows.append(('resample = "restamp"', "the timestamps are rounded"))
-        else:
-            rate = float(f"{clock.rate_hz:.3g}")
-            rows.append(
-                (f"resample = {{ rate_hz = {rate:.10g}, bridge_s = {BRIDGE / rate:.3g} }}", "the clock is irregular")
-            )
+        settings = f"{{ rate_hz = {rate:.10g}, bridge_s = {BRIDGE / rate:.3g} }}", "the clock is irregular"
+        rows["resample"] = ('"restamp"', "the timestamps are rounded") if clock.rounded_only else settings
     return rows
 
 
-def _describe_controller(
-    logs: Sequence[DescribedLog], actuator: Proposed, interview: Interview
-) -> list[tuple[str, str]]:
+def _describe_controller(logs: Sequence[DescribedLog], actuator: Proposed, interview: Interview) -> Rows:
     resonance, why = _find_resonance(logs)
     low, high = USUAL_BANDWIDTHS_HZ
     guess = min(max(5.0 * round(ABOVE_RESONANCE * resonance / 5.0), low), high) if resonance else DEFAULT_BANDWIDTH_HZ
     band = interview.number("bandwidth_hz", "Bandwidth of the controller", guess, why, detail=", in Hz")
-    rows = [
-        (f"plant = {format_toml(DESIGN)}", ""),
-        (f"measured = {format_toml(actuator.measured)}", "what is regulated"),
-        ('structure = "pid"', ""),
-        (f"bandwidth_hz = {band:.10g}", interview.mark("bandwidth_hz")),
-    ]
+    rows = {
+        "plant": (format_toml(DESIGN), ""),
+        "measured": (format_toml(actuator.measured), "what is regulated"),
+        "structure": ('"pid"', ""),
+        "bandwidth_hz": (f"{band:.10g}", interview.mark("bandwidth_hz")),
+    }
     if not low <= band <= high:
-        rows.append((f"bandwidth_range_hz = [{min(low, band / 4.0):.3g}, {max(high, band):.3g}]", ""))
+        rows["bandwidth_range_hz"] = f"[{min(low, band / 4.0):.3g}, {max(high, band):.3g}]", ""
     rate = logs[0].rate_hz
     usual, why = (float(f"{rate:.4g}"), "that of the log") if rate >= LEAST_RATE_HZ else (1000.0, "a typical value")
     label = "Rate at which the controller will run"
     sampled = interview.number("sample_rate_hz", label, usual, why, detail=", in Hz")
-    rows.append((f"sample_rate_hz = {sampled:.10g}", interview.mark("sample_rate_hz")))
+    rows["sample_rate_hz"] = f"{sampled:.10g}", interview.mark("sample_rate_hz")
     delayed = any(log.traits.delay_s for log in logs)
     default = "0, as for the program that logged" if delayed else "1"
     delay = f"from a reading to its command, besides the drive's fitted delay; {default} if left out"
-    rows.append(("# compute_delay_samples = 1", delay))
-    rows.append(_describe_limit(logs, interview))
+    rows["# compute_delay_samples"] = "1", delay
+    rows |= _describe_limit(logs, interview)
     noise = combine_noise(list_sensors(logs, actuator), actuator)
     gain = limit_noise_gain(logs, actuator.measured, noise, band, resonance)
     unit = SI_UNITS.get(actuator.measured, "N m")
     example = f": {noise:.3g} {unit} make up to {gain * noise:.3g} {unit}" if noise else ""
-    rows.append((f"max_noise_gain = {gain:.3g}", f"motor effort over sensor noise, at its peak{example}"))
+    rows["max_noise_gain"] = f"{gain:.3g}", f"motor effort over sensor noise, at its peak{example}"
     if actuator.robust_to:
-        rows.append((f"robust_to = {format_toml(list(actuator.robust_to))}", "Ms and Mt hold there too"))
+        rows["robust_to"] = format_toml(list(actuator.robust_to)), "Ms and Mt hold there too"
     return rows
 
 
-def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple[str, str]:
+def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> Rows:
     """Return the limit of the command, which is at least what the logs have."""
     role = logs[0].roles.input
     largest = max(float(np.nanmax(np.abs(log.signals[role]))) for log in logs)
@@ -305,24 +298,23 @@ def _describe_limit(logs: Sequence[DescribedLog], interview: Interview) -> tuple
     why = "the whole bridge" if role == "duty" else "the largest of the logs"
     key = "current_limit_A" if role in ("I", "torque") else "command_limit"
     limit = interview.number(key, f"Largest {what} that the drive may give", guess, why, detail=f" ({unit})")
-    return f"{key} = {limit:.10g}", interview.mark(key)
+    return {key: (f"{limit:.10g}", interview.mark(key))}
 
 
-def _describe_robustness(logs: Sequence[DescribedLog], actuator: Proposed) -> list[tuple[str, str]]:
-    plants = format_toml([DESIGN, *actuator.robust_to])
-    rows = [(f"plants = {plants}", "certified, over the uncertainty of the fit")]
+def _describe_robustness(logs: Sequence[DescribedLog], actuator: Proposed) -> Rows:
+    rows = {"plants": (format_toml([DESIGN, *actuator.robust_to]), "certified, over the uncertainty of the fit")}
     if actuator.ranges:
         ranges = ", ".join(f"{name} = [{low:.4g}, {high:.4g}]" for name, (low, high) in actuator.ranges.items())
-        rows.append((f"parameters = {{ {ranges} }}", "half to twice the value given"))
-    if actuator.ranges or any("prior_std" in line.value for line in actuator.lines):
-        rows.append((f"retune = {RETUNE}", "rounds of tuning for the worst case that the certificate finds"))
+        rows["parameters"] = f"{{ {ranges} }}", "half to twice the value given"
+    if actuator.ranges or any(line.prior_std is not None for line in actuator.lines):
+        rows["retune"] = f"{RETUNE}", "rounds of tuning for the worst case that the certificate finds"
     if sensors := list_sensors(logs, actuator):
         figures = {"noise_std": {}, "quantisation": {}}
         for name, noise in sensors.items():
             figures["noise_std"] |= {name: float(f"{noise.std:.3g}")} if noise.std else {}
             figures["quantisation"] |= {name: float(f"{noise.step:.4g}")} if noise.step else {}
         levels = {kind: levels for kind, levels in figures.items() if levels}
-        rows.append((f"sensors = {format_toml(levels)}", "as measured in the log, from sample to sample"))
+        rows["sensors"] = format_toml(levels), "as measured in the log, from sample to sample"
     return rows
 
 
@@ -349,11 +341,10 @@ def _spell_column(name: str, unit: str, scale: float, keys: Mapping[str, object]
     return format_toml({"column": name, "unit": unit} | ({"scale": scale} if scale != 1.0 else {}) | dict(keys or {}))
 
 
-def _align(rows: Sequence[tuple[str, str]]) -> list[str]:
+def _align(rows: Rows) -> list[str]:
     """Return lines with their comments below one another, and the signs of equality too."""
-    width = max(len(text.split(" = ")[0]) for text, _ in rows)
-    named = [(text.split(" = ", 1), comment) for text, comment in rows]
-    return [_comment(f"{name:<{width}} = {value}", comment) for (name, value), comment in named]
+    width = max(map(len, rows))
+    return [_comment(f"{name:<{width}} = {value}", comment) for name, (value, comment) in rows.items()]
 
 
 def _comment(text: str, comment: str) -> str:
