@@ -50,30 +50,15 @@ class FitFinding:
 
 @record
 class SilentEffect:
-    """An effect that the logs of a fit cannot tell: other values of some parameters follow them as well with it.
+    """An effect that the logs of a fit cannot tell: other values of some parameters follow them as well with it."""
 
-    Parameters
-    ----------
-    effect : str
-        In words.
-    part, parameter, unit : str
-        What would bring it ("" where the plant has it), and the parameter that is its size.
-    size : float
-        One that actuators have; where the parameter is there, how much more.
-    shifts : mapping of name to float
-        By how much each parameter that it touches would be more, per unit of it, in SI.
-    seen : float
-        Standard deviations by which such a size would change the residuals.
-
-    """
-
-    effect: str
-    part: str
-    parameter: str
+    effect: str  # in words
+    part: str  # that would bring it; "" where the plant has it
+    parameter: str  # that is its size
     unit: str
-    size: float
-    shifts: Mapping[str, float]
-    seen: float
+    size: float  # that actuators have; where the parameter is there, how much more
+    shifts: Mapping[str, float]  # by how much each parameter that it touches would be more, per unit of it, in SI
+    seen: float  # standard deviations by which such a size would change the residuals
 
 
 def state_guesses(guessed: Sequence[str]) -> str:
@@ -223,28 +208,14 @@ class DerivedFigure:
 
 @record
 class LogValues:
-    """What one log says alone of the values of a fit.
+    """What one log says alone of the values of a fit."""
 
-    Parameters
-    ----------
-    plant : str
-        The name of its plant.
-    amplitude : float
-        Standard deviation of the spring's force or torque, in the output's unit.
-    excess : float
-        Its residual over its sensor's noise, of the output where that is the largest.
-    values : mapping of parameter to (value, std)
-        Of the parameters that it determines with the fit's other values, with the std of noise.
-    determined : bool
-        Whether it determines all of them.
-
-    """
-
-    plant: str
-    amplitude: OrNaN
-    excess: OrInfinite
+    plant: str  # its name
+    amplitude: OrNaN  # standard deviation of the spring's force or torque, in the output's unit
+    excess: OrInfinite  # its residual over its sensor's noise, of the output where that is the largest
+    # with stds of noise, of the parameters that it determines with the fit's other values
     values: Mapping[str, tuple[float, OrInfinite]]
-    determined: bool
+    determined: bool  # whether it determines all of them
 
 
 @record

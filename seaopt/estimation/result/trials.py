@@ -31,41 +31,21 @@ def spell_parameters(frees: Mapping[str, float], fixed: Mapping[str, float]) -> 
 
 @record
 class HypothesisTrial:
-    """What a refit with one or two more effects left of the residual.
+    """What a refit with one or two more effects left of the residual."""
 
-    Parameters
-    ----------
-    effect : str
-        What the model would lack, in words.
-    parts : tuple of str
-        The parts that bring it, `seaopt.plants.PARTS`.
-    outcome : str
-        "adopted": it removes the excess, and nothing explains the logs better; "tied": it removes it as well; "tried":
-        it does not; "undecided": its refit was left before its minimum, for an evaluation would take more than 20 times
-        as many integration steps as the fit's, or more than can be made in a sample.
-    excess_before, excess : float
-        How many times its sensor's noise the residual is, of the output where it is most: of the fit, and with it;
-        infinite where nothing was simulated.
-    frees, fixed : mapping of name to value
-        The parts' parameters: what the refit gave, in SI units, and what was chosen for it.
-    parameters : mapping of name to value
-        Every free parameter of the refit.
-    evaluations : int
-        What the refit took.
-    proposal : str
-        Lines of a problem file that add it; NAME stands for the plant's.
-    python : str
-        The same as a call.
-    """
-
-    effect: str
-    parts: tuple[str, ...]
+    effect: str  # that the model would lack, in words
+    parts: tuple[str, ...]  # that bring it, of `seaopt.plants.PARTS`
+    # adopted: it removes the excess, and nothing explains the logs better; tied: it removes it as well; tried: it does
+    # not; undecided: its refit was left before its minimum, for an evaluation would take more than 20 times as many
+    # integration steps as the fit's, or more than can be made in a sample
     outcome: Outcome
+    # how many times its sensor's noise the residual is, of the output where it is most: of the fit, and with the
+    # effect; infinite where nothing was simulated
     excess_before: OrInfinite
     excess: OrInfinite
-    frees: Mapping[str, float]
-    fixed: Mapping[str, float]
-    parameters: Mapping[str, float]
-    evaluations: int
-    proposal: str = ""
-    python: str = ""
+    frees: Mapping[str, float]  # the parts' parameters, in SI units: what the refit gave,
+    fixed: Mapping[str, float]  # and what was chosen for it
+    parameters: Mapping[str, float]  # every free one of the refit
+    evaluations: int  # that it took
+    proposal: str = ""  # lines of a problem file that add it; NAME stands for the plant's
+    python: str = ""  # the same as a call
