@@ -254,16 +254,17 @@ class _Spectra:
         terms = 1.0 / (self.averages - 1.0 - np.arange(self.inputs))
         mean, variance = float(np.sum(terms)), float(np.sum(terms**2))
         octave = np.floor(np.log2(f[-1] / f)).astype(int)
-        best, band, numbers = 1.0, (float(f[0]), float(f[-1])), np.unique(octave)[:OCTAVES]
-        for number in numbers:
-            rows = octave == number
+        starts = np.flatnonzero(np.diff(octave, prepend=octave[0] + 1))[-OCTAVES:]  # from the lowest one on
+        ends, sums = np.append(starts[1:], f.size), np.add.reduceat(statistic, starts)
+        best, band = 1.0, (float(f[0]), float(f[-1]))
+        for start, end, total in zip(starts[::-1], ends[::-1], sums[::-1], strict=True):
             # Neighbouring lines of a Hann window share two thirds of their amplitude: two lines tell as much as one.
-            n = max(0.5 * np.count_nonzero(rows), 1.0)
+            n = max(0.5 * (end - start), 1.0)
             shape, scale = n * mean**2 / variance, variance / mean
-            p = exceeds(shape, n * float(np.mean(statistic[rows])) / scale)
+            p = exceeds(shape, n * float(total) / (end - start) / scale)
             if p < best:
-                best, band = p, (float(f[rows][0]), float(f[rows][-1]))
-        return min(best * numbers.size * trials, 1.0), band
+                best, band = p, (float(f[start]), float(f[end - 1]))
+        return min(best * starts.size * trials, 1.0), band
 
 
 def _make_spectra(
