@@ -43,6 +43,7 @@ from seaopt.control import (
     runnable,
 )
 from seaopt.control.loops.compensation.terms import FORGOTTEN
+from seaopt.control.loops.law import Law
 from seaopt.control.running.law_step import run_law
 from seaopt.errors import SeaoptError
 from seaopt.logs.quality.faults import find_quantisation
@@ -326,14 +327,13 @@ class Inputs:
         columns = np.column_stack([reference, ticks.measured])
         return cls(columns=columns, added=added, spectra=transform(columns))
 
-    def respond(self, law: RunnableLaw) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n k"]]:
-        """Return the commands of a law that starts from zero, and what each state at the first row adds to them."""
+    def respond(self, law: Law) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n k"]]:
+        """Return the efforts of a law that starts from zero, and what each state at the first row adds to them."""
         n = len(self.columns)
         rows = list_powers(law.c, law.a, n)
-        weights, direct = take_weights(law)
-        out = self.columns @ direct + self.added
-        out[1:] += np.fft.irfft(np.sum(transform(rows @ weights) * self.spectra, axis=1))[: n - 1]
-        return law.per_effort * out, law.per_effort * rows
+        out = self.columns @ law.d + self.added
+        out[1:] += np.fft.irfft(np.sum(transform(rows @ law.b) * self.spectra, axis=1))[: n - 1]
+        return out, rows
 
 
 def take_weights(law: RunnableLaw) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, " k"]]:
@@ -416,18 +416,39 @@ def follow(
     in the log; with a share of the limit. That is linear in reference, readings and share.
     """
     if not np.any(limited) or not math.isfinite(law.force_limit_N):
-        return Inputs.make(law, ticks).respond(law)[0]
+        (b, d), given = take_weights(law), Inputs.make(law, ticks)
+        return law.per_effort * given.respond(Law(a=law.a, b=b, c=law.c, d=d, sample_time_s=law.sample_time_s))[0]
     columns, (reference, added) = np.reshape(law.b_measurement, (law.c.size, -1)), _compensate(law, ticks)
     direct = law.d_reference * reference - ticks.measured @ np.ravel(law.d_measurement) + added
     drive = np.outer(reference, law.b_reference) - ticks.measured @ columns.T
-    x, out, most = np.zeros(law.c.size), np.empty(len(ticks)), share * law.force_limit_N
-    signs, at_limit = np.sign(ticks.command), limited.tolist()
-    for k in range(len(ticks)):
-        out[k] = float(law.c @ x) + direct[k]
-        x = law.a @ x + drive[k]
-        if at_limit[k]:
-            x = x + law.anti_windup * (most * signs[k] - out[k])
-    return law.per_effort * out
+    over = share * law.force_limit_N * np.sign(ticks.command) - direct
+    drive += np.outer(np.where(limited, over, 0.0), law.anti_windup)
+    ways = np.array([law.a, law.a - np.outer(law.anti_windup, law.c)])
+    return law.per_effort * (_scan(ways, limited, drive) @ law.c + direct)
+
+
+def _scan(
+    ways: Float[np.ndarray, "2 m m"], second: Bool[np.ndarray, " n"], drive: Float[np.ndarray, "n m"]
+) -> Float[np.ndarray, "n m"]:
+    """Return the states, from zero on, of which each is one of two matrices times the one before, and what drives it:
+    those within blocks of rows side by side, from zero and from each state at their starts, then block after block.
+    """
+    n, m = drive.shape
+    rows = math.isqrt(n) + 1
+    blocks = -(-n // rows)
+    spare = blocks * rows - n
+    taken = ways[np.pad(second, (0, spare)).astype(int)].reshape(blocks, rows, m, m)
+    driven = np.pad(drive, ((0, spare), (0, 0))).reshape(blocks, rows, m)
+    moved, within = np.tile(np.eye(m, m + 1), (blocks, 1, 1)), np.empty((blocks, rows, m, m + 1))
+    for k in range(rows):
+        within[:, k] = moved
+        moved = taken[:, k] @ moved
+        moved[:, :, m] += driven[:, k]
+    starts = np.zeros((blocks, m))
+    for k in range(1, blocks):
+        starts[k] = moved[k - 1, :, :m] @ starts[k - 1] + moved[k - 1, :, m]
+    states = np.einsum("bkij,bj->bki", within[..., :m], starts) + within[..., m]
+    return states.reshape(-1, m)[:n]
 
 
 def _estimate_start(law: RunnableLaw, ticks: Ticks, allowed: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:

@@ -10,7 +10,8 @@ import pytest
 import seaopt as so
 from seaopt.control import Gains, runnable
 from seaopt.machine.bringup.excitation import design_excitation
-from seaopt.machine.stepped import find_modes, find_steady
+from seaopt.machine.stepped import find_at_limit, find_modes, find_steady, follow
+from seaopt.machine.ticks import take_ticks
 from seaopt.machine.wording import say_cause
 from tests.machine.conftest import SPEC
 from tests.machine.simulator import Bench, Machine, multisine
@@ -55,6 +56,22 @@ def test_what_a_state_adds_to_the_commands_is_what_steps_add(controller):
         expected.append(law.per_effort * effort)
         x = law.a @ x + law.b_reference - at_limit * law.anti_windup * effort
     np.testing.assert_allclose(find_steady(law, limited), expected, rtol=1e-9, atol=1e-12 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.0])
+def test_commands_with_the_limit_as_logged_are_those_of_steps(controller, bench, share):
+    law, ticks = runnable(controller), take_ticks(controller, bench.log(Machine(), 4.0 * REFERENCE))
+    limited, x, expected = find_at_limit(ticks, law), np.zeros(law.c.size), []
+    assert 0.1 < np.mean(limited) < 0.9
+    for reference, reading, command, at_limit in zip(
+        ticks.reference, ticks.measured[:, 0], ticks.command, limited, strict=True
+    ):
+        effort = law.c @ x + law.d_reference * reference - law.d_measurement * reading
+        expected.append(law.per_effort * effort)
+        over = share * law.force_limit_N * np.sign(command) - effort
+        x = law.a @ x + law.b_reference * reference - law.b_measurement * reading + at_limit * law.anti_windup * over
+    atol = 1e-12 * np.max(np.abs(expected))
+    np.testing.assert_allclose(follow(law, ticks, limited, share), expected, rtol=1e-9, atol=atol)
 
 
 @pytest.mark.parametrize("decimals", [None, 2, 0])

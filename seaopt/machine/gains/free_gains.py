@@ -26,7 +26,7 @@ from seaopt.control.laws.structures import LAW_GAINS, Gains
 from seaopt.control.loops.law import Law
 from seaopt.errors import SeaoptError
 from seaopt.logs.quality.faults import find_runs
-from seaopt.machine.stepped import FLOOR, Inputs, Others, Setting, find_at_limit, take_weights, transform
+from seaopt.machine.stepped import FLOOR, Inputs, Others, Setting, find_at_limit, transform
 from seaopt.machine.ticks import Ticks
 from seaopt.records import record
 
@@ -40,15 +40,12 @@ STEP = 1e-6  # of a logarithm, by which the search differentiates
 SAME_GAINS = 0.01  # relative: gains that are those of another law
 
 
-def make_law(
-    controller: Controller, gains: Gains, sample_time_s: float | None = None, *, balanced: bool = True
-) -> Callable[[Setting], Setting]:
+def make_law(controller: Controller, gains: Gains, sample_time_s: float | None = None) -> Callable[[Setting], Setting]:
     """Return what gives a setting the law of other gains, or of another sample time, with the guards that it has."""
 
     def change(setting: Setting) -> Setting:
         period = sample_time_s or controller.sample_time_s
-        law = gains.law(controller.spec.structure, period)
-        made = runnable(replace(controller, law=law.balanced() if balanced else law))
+        made = runnable(replace(controller, law=gains.law(controller.spec.structure, period).balanced()))
         guards: dict[str, Any] = {
             name: getattr(setting.linear, name) for name in ("gate", "heat", "compensation", "command_limit")
         }
@@ -99,12 +96,13 @@ def fit_gains(setting: Setting) -> Gains | None:
     own, rows = setting.controller.read_gains(), _find_free(setting)
     if own is None or not isinstance(setting.law, RunnableLaw) or not rows:
         return None
-    runs = [_Run(commands=ticks.command, inputs=Inputs.make(setting.linear, ticks)) for ticks in rows]
-    numbers, scale = _Numbers(gains=own), float(np.std(setting.ticks.command))
+    linear = setting.linear
+    runs = [_Run(efforts=ticks.command / linear.per_effort, inputs=Inputs.make(linear, ticks)) for ticks in rows]
+    numbers, scale = _Numbers(gains=own), float(np.std(setting.ticks.command)) / abs(linear.per_effort)
     names, first = list(numbers.times), np.log(list(numbers.times.values()))
 
     def solve(z: Float[np.ndarray, " t"]) -> tuple[Gains, Float[np.ndarray, " n"]]:
-        return _project(setting, runs, numbers, dict(zip(names, np.exp(z).tolist(), strict=True)))
+        return _project(setting.controller, runs, numbers, dict(zip(names, np.exp(z).tolist(), strict=True)))
 
     best: tuple[float, Gains] | None = None
     for factor in STARTS:
@@ -127,41 +125,39 @@ def fit_gains(setting: Setting) -> Gains | None:
 class _Run:
     """A run of rows without a limit."""
 
-    commands: Float[np.ndarray, " n"]
+    efforts: Float[np.ndarray, " n"]
     inputs: Inputs
 
     def leave_states(
-        self, first: RunnableLaw, others: Sequence[Law]
+        self, first: Law, others: Sequence[Law]
     ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-        """Return what each of other laws makes more than a first one, and the logged commands less those of the first,
+        """Return what each of other laws makes more than a first one, and the logged efforts less those of the first,
         from zero, both without what a state at the first row adds. They have the first one's time constants, and so
         its states, which take something else of what they are given.
         """
-        commands, rows = self.inputs.respond(first)
-        weights, direct = take_weights(first)
-        more = np.stack([law.b for law in others], axis=2) - weights[:, :, None]
-        out = first.per_effort * self.inputs.columns @ (np.stack([law.d for law in others], axis=1) - direct[:, None])
+        made, rows = self.inputs.respond(first)
+        more = np.stack([law.b for law in others], axis=2) - first.b[:, :, None]
+        out = self.inputs.columns @ (np.stack([law.d for law in others], axis=1) - first.d[:, None])
         taken = (transform(rows) @ more.reshape(len(more), -1)).reshape(-1, *more.shape[1:])
         out[1:] += np.fft.irfft(np.einsum("fko,fk->fo", taken, self.inputs.spectra), axis=0)[: len(rows) - 1]
         basis = np.linalg.qr(rows / np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny))[0]
-        columns = np.column_stack([out, self.commands - commands])
+        columns = np.column_stack([out, self.efforts - made])
         columns -= basis @ (basis.T @ columns)
         return columns[:, :-1], columns[:, -1]
 
 
 def _project(
-    setting: Setting, runs: Sequence[_Run], numbers: _Numbers, times: Mapping[str, float]
+    controller: Controller, runs: Sequence[_Run], numbers: _Numbers, times: Mapping[str, float]
 ) -> tuple[Gains, Float[np.ndarray, " n"]]:
     """Return the best gains at given time constants, and what they and the best states at the start of each run leave
-    of the commands.
+    of the efforts.
     """
-    own, controller = numbers.linear, setting.controller
-    first = make_law(controller, numbers.make(own, times), balanced=False)(setting).linear
-    # Where each gain is half as large again, of which the commands change by half of its column.
-    others = [
+    own = numbers.linear
+    # Its own gains, and where each is half as large again, of which the efforts change by half of its column.
+    first, *others = (
         numbers.make(own + 0.5 * step, times).law(controller.spec.structure, controller.sample_time_s)
-        for step in np.diag(own)
-    ]
+        for step in (np.zeros(own.size), *np.diag(own))
+    )
     table, target = (
         np.concatenate(each) for each in zip(*(run.leave_states(first, others) for run in runs), strict=True)
     )
