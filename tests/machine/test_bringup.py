@@ -102,22 +102,23 @@ def test_the_files_state_whether_the_fit_is_met(plan, tmp_path, fit_met):
     assert json.loads((tmp_path / "full" / "controller.json").read_text()).get("fit_met") is fit_met
 
 
-def test_where_no_slower_law_is_certified_it_is_the_same_with_less_effort(controller):
+def test_where_no_slower_law_is_certified_it_is_the_same_with_less_effort(controller, plan):
     def refuse(fraction):
         raise so.SeaoptError("none")
 
-    kept = []
-    plan = so.bring_up(
+    kept, options = [], {"samples": 5, "large_signals": False}
+    lowered = so.bring_up(
         controller,
         {"stand": so.plants.high_impedance()},
         so.plants.thor(),
         fractions=(0.25,),
+        certificate=plan.stages[-1].certificate,
         tune_stage=refuse,
         keep_stage=lambda stage: kept.append(stage.name),
-        certify_stage=lambda law: so.certify(law, {"stand": so.plants.high_impedance()}, so.plants.thor(), samples=5),
+        certify_stage=lambda law: so.certify(law, {"stand": so.plants.high_impedance()}, so.plants.thor(), **options),
     )
-    stage = plan.stages[0]
-    assert kept == [each.name for each in plan.stages]
+    stage = lowered.stages[0]
+    assert kept == [each.name for each in lowered.stages]
     assert stage.controller.command_limit == 2.25 and "effort" in stage.note
     assert np.array_equal(stage.controller.law.a, controller.law.a)
 
@@ -133,7 +134,7 @@ def rubbing():
         current_limit_A=9.0,
     )  # fmt: skip
     law = so.tune(plant, values, spec)
-    return plant, values, law, so.certify(law, {"knee": plant}, values, samples=5)
+    return plant, values, law, so.certify(law, {"knee": plant}, values, samples=5, simulations=False)
 
 
 def plan_first(rubbing, share):
@@ -191,7 +192,7 @@ def test_a_stage_moves_the_motor_against_its_friction_or_says_that_it_does_not(
     assert ("dry friction held the motor" in said) is not moves
 
 
-def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(tmp_path):
+def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(plan, tmp_path):
     """The stuck plant is that of the equations: a motor that does not move behind its spring, but for v_s."""
     from seaopt.machine.bringup.page import write_bring_up_page
     from seaopt.reporting import write_report
@@ -209,9 +210,8 @@ def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(t
     stuck = f[np.flatnonzero(tracking < np.sqrt(0.5) * tracking[0])[0]]
     said = format_number(law.measure_states()[" stuck"].bandwidth_hz, 3)
     assert float(said) == pytest.approx(stuck, rel=0.03) and float(said) < 0.7 * 30.0
-    plan = so.bring_up(
-        law, {"stand": so.plants.high_impedance()}, values, samples=5, fractions=(), limits={"F1": 600.0}
-    )
+    options = {"fractions": (), "limits": {"F1": 600.0}, "certificate": plan.stages[-1].certificate}
+    plan = so.bring_up(law, {"stand": so.plants.high_impedance()}, values, **options)
     both = f"30 Hz sliding and {said} Hz stuck"
     page = write_bring_up_page(plan, tmp_path / "bringup.html").read_text()
     report = write_report([law], tmp_path / "report.html").read_text()
@@ -236,15 +236,15 @@ def test_what_cannot_be_played_is_refused(controller, plan):
             so.bring_up(controller, certify_stage=unused, **options | wrong)
 
 
-def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_whole_run():
+def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_whole_run(plan):
     from seaopt.control import CompensateFriction, add_compensation, run_loop
     from seaopt.control.running.sampled_loop import SampledLoop
 
     stand, values = so.plants.high_impedance(), so.plants.thor().update(f_c=300.0, v_s=5e-3)
     law = so.tune(stand, values, so.ControllerSpec(bandwidth_hz=30, max_noise_gain=45, current_limit_A=9.0))
     law = add_compensation(law, friction=CompensateFriction(fraction=0.8))
-    plan = so.bring_up(law, {"stand": stand}, values, samples=20, fractions=(), limits={"F1": 600.0})
-    excitation = plan.stages[0].excitation
+    options = {"fractions": (), "limits": {"F1": 600.0}, "certificate": plan.stages[-1].certificate}
+    excitation = so.bring_up(law, {"stand": stand}, values, **options).stages[0].excitation
     period, rows = excitation.waves.shape[1], excitation.reference
     joints = period * (1 + excitation.periods * np.arange(1, len(excitation.waves)))
     assert np.max(np.abs(np.diff(rows)[joints - 1])) < np.max(np.abs(np.diff(rows[period : 2 * period])))
@@ -253,7 +253,7 @@ def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_wh
     assert np.max(np.abs(run.current)) <= 1.001 * excitation.peaks["I"] < 0.8 * 9.0
 
 
-def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(compiler, tmp_path):
+def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(plan, compiler, tmp_path):
     """Played on the simulator in C, with its own noise: no tick is at the limit, which would cost its period, and the
     machine is told from one with twice the friction."""
     knee = so.plants.rotary(link="locked")
@@ -268,11 +268,11 @@ def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(compiler
     def tune_nothing(fraction):
         raise so.SeaoptError("no law at this bandwidth")
 
-    plan = so.bring_up(
+    stages = so.bring_up(
         law, {"knee": knee}, values, samples=5, fractions=(0.2,), limits={"tau_s": 45.0}, tune_stage=tune_nothing,
-        sensors=so.Sensors(noise_std={"tau_s": 0.05}),
-    )  # fmt: skip
-    stage = plan.stages[0]
+        sensors=so.Sensors(noise_std={"tau_s": 0.05}), certificate=plan.stages[-1].certificate,
+    ).stages  # fmt: skip
+    stage = stages[0]
     assert "beside which the noise of what it reads has no room" in stage.note and stage.certificate.met
     bench, reference = Bench(compiler, tmp_path, stage.controller), stage.excitation.reference
     log = bench.log(Machine.of_knee(values), reference, noise=0.05)
@@ -283,10 +283,10 @@ def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(compiler
     rubbing = bench.log(Machine.of_knee(values.update(f_c=0.02)), reference, noise=0.05)
     found = so.accept(stage.controller, [rubbing]).differences.found[0]
     assert "f_c" in (found.name, *found.alike) and found.explains > 0.95
-    assert len(plan.stages) == 2
+    assert len(stages) == 2
     (tmp_path / "full").mkdir()
     full = Bench(compiler, tmp_path / "full", law).log(
-        Machine.of_knee(values), plan.stages[1].excitation.reference, noise=0.05
+        Machine.of_knee(values), stages[1].excitation.reference, noise=0.05
     )
     assert so.accept(law, [full]).met
 
@@ -317,7 +317,8 @@ def test_with_dry_friction_the_page_does_not_ask_that_logs_lie_in_the_band_of_th
 
     stand, values = so.plants.high_impedance(), so.plants.thor().update(f_c=60.0, v_s=5e-3)
     law = so.tune(stand, values, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
-    rubbing = so.bring_up(law, {"stand": stand}, values, samples=5, fractions=())
+    certificate = plan.stages[-1].certificate
+    rubbing = so.bring_up(law, {"stand": stand}, values, fractions=(), certificate=certificate)
     without, with_ = (write_bring_up_page(each, tmp_path / "bringup.html").read_text() for each in (plan, rubbing))
     assert "must lie" in without and "dry friction" not in without
     assert "must lie" not in with_ and "It has 60 N of dry friction at the spring" in with_

@@ -224,7 +224,7 @@ def test_a_weight_beside_predictive_control_is_replayed_and_missed(planned, limi
     mpc = replace(
         planned.controller, compensation=Compensation(sample_time_s=planned.controller.sample_time_s, gravity=weight)
     )
-    reference = np.where(np.arange(800) % 400 < 200, 0.0, 2400.0) if limited else SHORT[:1000]
+    reference = np.where(np.arange(480) % 240 < 120, 0.0, 2400.0) if limited else SHORT[:600]
     log = Bench(compiler, tmp_path, mpc).log(Machine(), reference)
     (row,) = so.accept(mpc, [log]).replays
     assert row.met and row.largest < 1e-6 and (row.saturated > 0.02) is limited

@@ -18,19 +18,26 @@ from tests.machine.test_bringup import MAIN
 from tests.machine.test_outer_loop import Quiet, make_log, run, take_link
 
 
-def plan_outer(law, link, **limits):
+@pytest.fixture(scope="module")
+def certificate(impedance):
+    """Return that of a law alone: what its outer loop is given does not depend on it."""
+    plants = {"stand": impedance.design[0], "knee": so.plants.rotary()}
+    return so.certify(impedance, plants, impedance.design[1], samples=2, simulations=False)
+
+
+def plan_outer(law, link, certificate, **limits):
     plants = {"stand": law.design[0], "knee": link[0]}
     noise = so.Sensors(noise_std={"tau_s": 0.02, "theta_l": 1e-5})  # that of `run`
-    options = {"samples": 2, "fractions": (), "limits": {"tau_s": 40.0, **limits}, "sensors": noise}
+    options = {"fractions": (), "limits": {"tau_s": 40.0, **limits}, "sensors": noise, "certificate": certificate}
     return so.bring_up(law, plants, link[1], link=link, **options)
 
 
 @pytest.mark.parametrize("stiffness", [20.0, 0.0])
 def test_the_full_law_has_a_reference_for_its_outer_loop_whose_log_is_accepted(
-    impedance, damping, stiffness, compiler, tmp_path
+    impedance, damping, certificate, stiffness, compiler, tmp_path
 ):
     law = impedance if stiffness else damping
-    plan = plan_outer(law, take_link(), theta_l=0.06)
+    plan = plan_outer(law, take_link(), certificate, theta_l=0.06)
     write_bring_up(plan, tmp_path)
     folder = tmp_path / "full"
     table = so.read_log(folder / "outer_reference.csv")
@@ -61,9 +68,11 @@ def test_the_full_law_has_a_reference_for_its_outer_loop_whose_log_is_accepted(
 
 
 @pytest.mark.parametrize("stiffness", [20.0, 0.0])
-def test_what_follows_a_step_with_the_outer_loop_is_that_of_the_machine(impedance, damping, stiffness, monkeypatch):
+def test_what_follows_a_step_with_the_outer_loop_is_that_of_the_machine(
+    impedance, damping, certificate, stiffness, monkeypatch
+):
     law = impedance if stiffness else damping
-    around = plan_outer(law, take_link()).stages[-1].around
+    around = plan_outer(law, take_link(), certificate).stages[-1].around
     monkeypatch.setattr(np.random, "default_rng", lambda seed: Quiet())
     size = 0.99 * around.step_size
     rows = run(law, np.full(len(around.step.at), size), stiffness=stiffness)
@@ -72,10 +81,10 @@ def test_what_follows_a_step_with_the_outer_loop_is_that_of_the_machine(impedanc
     assert np.max(np.abs(rows[:, 4])) == pytest.approx(0.99 * 9.0, rel=2e-3)
 
 
-def test_with_dry_friction_six_sets_of_phases_move_the_motor_and_are_accepted(impedance):
+def test_with_dry_friction_six_sets_of_phases_move_the_motor_and_are_accepted(impedance, certificate):
     knee, values = take_link()
     link = knee, values.update(f_c=0.005, v_s=1.0)
-    around = plan_outer(impedance, link).stages[-1].around
+    around = plan_outer(impedance, link, certificate).stages[-1].around
     assert len(around.excitation.waves) == 6 and not around.still
     assert around.friction == pytest.approx(KNEE["N"] * 0.005, rel=0.01)
     rows = run(impedance, around.excitation.reference, dry=0.005)
@@ -87,15 +96,16 @@ def test_with_dry_friction_six_sets_of_phases_move_the_motor_and_are_accepted(im
     assert np.all(np.max(np.abs(rows), axis=0)[[2, 3, 4]] < [around.stop[name] for name in ("tau_s", "theta_l", "I")])
 
 
-def test_without_the_plant_of_the_link_there_is_no_such_reference(impedance):
+def test_without_the_plant_of_the_link_there_is_no_such_reference(impedance, certificate):
     plants = {"stand": impedance.design[0], "knee": so.plants.rotary()}
-    plan = so.bring_up(impedance, plants, impedance.design[1], samples=2, fractions=(), limits={"tau_s": 40.0})
+    options = {"fractions": (), "limits": {"tau_s": 40.0}, "certificate": certificate}
+    plan = so.bring_up(impedance, plants, impedance.design[1], **options)
     assert plan.stages[-1].around is None and "over the stiffness, 20 N m/rad" in " ".join(repr(plan).split())
 
 
-def test_an_outer_loop_that_is_not_stable_on_its_link_is_not_to_be_closed():
+def test_an_outer_loop_that_is_not_stable_on_its_link_is_not_to_be_closed(certificate):
     """A stiffness of the link as large as its spring's is more than the law follows."""
-    plan = plan_outer(make_knee(300.0), take_link())
+    plan = plan_outer(make_knee(300.0), take_link(), certificate)
     text = " ".join(repr(plan).split())
     assert plan.stages[-1].around is None and plan.to_dict()["stages"][-1]["outer_unstable"]
     assert "DO NOT CLOSE ITS OUTER LOOP: by the model it is not stable with the link as in knee" in text
@@ -103,9 +113,9 @@ def test_an_outer_loop_that_is_not_stable_on_its_link_is_not_to_be_closed():
 
 
 def test_rows_that_the_outer_loops_filter_forgets_in_are_counted_and_how_long_to_record_is_that_of_its_own_reference(
-    impedance,
+    impedance, certificate
 ):
-    around = plan_outer(impedance, take_link()).stages[-1].around
+    around = plan_outer(impedance, take_link(), certificate).stages[-1].around
     period = around.excitation.waves.shape[1]
     played = Played(period_s=77.0, lasts_s=777.0, outer=Played(period_s=period * 1e-3, lasts_s=12 * period * 1e-3))
     log = make_log(run(impedance, around.excitation.reference[: 3 * period // 2]))
