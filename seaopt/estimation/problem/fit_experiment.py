@@ -60,6 +60,18 @@ class FitSegment:
         present[:, : max(settle - chosen.start, 0)] = False
         return present.T
 
+    def take_first(self, count: int) -> FitSegment:
+        """Return the first so many samples."""
+        old = self.samples
+        samples = replace(
+            old,
+            u=tuple(channel[: old.lead + count] for channel in old.u),
+            y=tuple(channel[:count] for channel in old.y),
+            keep=tuple(mask[:count] for mask in old.keep),
+            shares=None if old.shares is None else old.shares[:, :count],
+        )
+        return replace(self, samples=samples)
+
     @property
     def has_start(self) -> bool:
         """Whether the data show the initial state: not where all samples are held out."""
@@ -122,6 +134,10 @@ class FitExperiment:
     def longest(self) -> int:
         """Samples of the longest segment."""
         return max(segment.samples.n for segment in self.segments)
+
+    def take_first(self, count: int) -> FitExperiment:
+        """Return the experiment with the first so many samples of each segment."""
+        return replace(self, segments=tuple(segment.take_first(count) for segment in self.segments))
 
     def count_weighted(self) -> Int[np.ndarray, " ny"]:
         """Return how many samples of each output are there and have a weight."""

@@ -16,10 +16,17 @@ from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.delay_cells import shift_start
 from seaopt.estimation.solver.first_guess import guess_from_responses
+from seaopt.estimation.solver.growing import follow_parts, is_noise
 from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.loosening import loosen_start
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
-from seaopt.estimation.solver.settle import Solved, explains_little, settle, settle_roughly
+from seaopt.estimation.solver.settle import (
+    Solved,
+    explains_little,
+    measure_misfit,
+    settle,
+    settle_roughly,
+)
 from seaopt.estimation.solver.shots import cut_problem, find_start_on_shots, grow_shots
 from seaopt.estimation.solver.starts_around import search_around
 from seaopt.records import record
@@ -77,8 +84,8 @@ class OutputError(Method):
         """Settle from the best start that can be found."""
         best, guesses = find_start(problem, self)
         best, spent = _approach_waves(problem, best, callback) if self.search else (best, 0)
-        if self.search and any(e.model.sticks for e in problem.experiments) and explains_little(problem, best.power):
-            best, more = _compare_predicting(problem, best, self, callback)
+        if self.search and any(e.model.sticks for e in problem.experiments):
+            best, more = _approach_sticking(problem, best, self, callback)
             spent += more
         solved = settle(problem, best, self.max_iterations, callback)
         solved = replace(solved, solution=replace(solved.solution, iterations=spent + solved.solution.iterations))
@@ -280,24 +287,26 @@ def _list_waves(problem: FitProblem, *, sizes: bool = False) -> list[int]:
     return [i for i, name in enumerate(problem.unknowns.names) if name.rpartition(".")[2] in names]
 
 
-def _compare_predicting(
+def _approach_sticking(
     problem: FitProblem, start: Evaluation, method: Method, callback: Callback | None
 ) -> tuple[Evaluation, int]:
-    """Return the better of two rough minima, from a start and from where the plant predicts, and their iterations.
-    Where joints move at other times than in the log the cost has many minima, none of which explains it: a search that
-    went all the way would creep.
+    """Return a start that leaves noise, itself or followed over growing parts of the logs; or else the best of that, a
+    rough minimum from the start, and where that explains little, one from where the plant predicts; and the iterations
+    of rough minima. Where joints move at other times than in the log the cost has many minima, none of which explains
+    it: a search that went all the way would creep.
     """
-    roughly = name_phase(callback, "looking for a start")
-    minima = [settle_roughly(problem, start, roughly)] if np.isfinite(start.cost) else []
+    roughly, finite = name_phase(callback, "looking for a start"), np.isfinite(start.cost)
+    followed = start if not finite or is_noise(problem, start.z) else follow_parts(problem, start, roughly)
+    if finite and (followed is start or is_noise(problem, followed.z)):
+        return followed, 0
+    minima = [settle_roughly(problem, start, roughly)] if finite else []
     if not minima or explains_little(minima[0].problem, minima[0].solution.evaluation.power):
         z = find_predicting_start(problem, start.z, method.max_iterations, roughly)
         predicting = None if z is None else problem.evaluate(z)
         if predicting is not None and np.isfinite(predicting.cost):
             minima.append(settle_roughly(problem, predicting, roughly))
-    if not minima:
-        return start, 0
-    best = min(minima, key=lambda each: each.misfit)
-    return problem.evaluate(best.solution.z), sum(each.solution.iterations for each in minima)
+    found = [followed, *(problem.evaluate(each.solution.z) for each in minima)]
+    return min(found, key=measure_misfit), sum(each.solution.iterations for each in minima)
 
 
 def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> Solved:

@@ -21,11 +21,11 @@ import numpy as np
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.noise_floor import measure_excess
 from seaopt.estimation.problem.normal_equations import invert
+from seaopt.estimation.solver.growing import NOISE
 from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.settle import Solved, settle, settle_roughly
 
 FAR = 10.0  # times its given value, from which one has strayed
-NOISE = 1.5  # times a sensor's own, that a residual is at most where nothing is wrong
 LOST = 100.0  # times a sensor's own: what a search that ended near by leaves where joints stick
 OFF, STARTS = 2.0, 12  # times the given values, and how many starts
 
