@@ -32,11 +32,12 @@ ROUGH_ITERATIONS, ROUGH_ROUNDS, ROUGH_SUBSTEPS = 15, 2, 8  # of a minimum that i
 NEAR = 1e-2  # squared standard deviations that may be left to it
 FALL = 4.0  # of a smoothing speed of friction, in a stage
 TOLD = 2.0  # of the misfit, which is twice a log-likelihood: what sharper friction has to gain
-HALF = 0.5  # of the finest steps, which leaves room to check their error
+ROOM = 0.25  # of the finest steps, up to which a smoothing speed is searched: the rest makes the steps' error small
+HALF = 0.5  # of those, beyond which nothing sharper is tried
 THROWS = (-0.3, -0.03, 0.03, 0.3)  # of the speed that its input could give a joint
-FLAT = 1e-6  # of a cost where joints stick: far less than its noise
-JUMPY_DECREMENT = 1e-2  # where joints stick, residuals jump a little as a stop moves to another integration step
-FLAT_DECREMENT = 1e-3  # process noise that is hardly there, or sharp friction, is a flat direction: slow to search
+FLAT = 1e-6  # of a cost where joints stick, or friction gets sharp: far less than its noise
+JUMPY_DECREMENT = 1e-2  # there residuals jump a little as a stop moves to another integration step
+FLAT_DECREMENT = 1e-3  # process noise that is hardly there is a flat direction: slow to search
 
 
 @record(eq=False)
@@ -137,7 +138,7 @@ def sharpen(problem: FitProblem, start: Evaluation, solve: Callable[[FitProblem,
 
 def _measure_stiffness(problem: FitProblem, z: Vector) -> float:
     """Return the stable integration steps over those that a search may take."""
-    return max(e.count_stable_steps(z) for e in problem.experiments) / (HALF * MAX_SUBSTEPS)
+    return max(e.count_stable_steps(z) for e in problem.experiments) / (ROOM * MAX_SUBSTEPS)
 
 
 def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback: Callback | None) -> Solved:
@@ -146,7 +147,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
         solution = minimise(problem, start, unknowns.low, unknowns.high)
         return Solved(problem=problem, solution=solution, step_error=StepError(output=np.inf))
     problem, evaluation = choose_first_steps(problem, start)
-    decrement = FLAT_DECREMENT if problem.predicts or problem.find_smoothing() else DECREMENT
+    decrement = FLAT_DECREMENT if problem.predicts else DECREMENT
     flat = measure_flatness(problem)
     if flat:
         decrement = JUMPY_DECREMENT
@@ -210,10 +211,12 @@ def _tell_round(callback: Callback | None, problem: FitProblem, number: int) -> 
 
 
 def measure_flatness(problem: FitProblem) -> float:
-    """Return the share of the cost that is no change: nothing where no joint sticks, or bends before it slips, and the
-    cost is smooth.
+    """Return the share of the cost that is no change: nothing where no joint sticks, or bends before it slips, nor gets
+    as sharp as it likes, and the cost is smooth. A search among the kinks that a step makes of sharp friction creeps on
+    with the last digit, in place of shorter steps that take the kinks away.
     """
-    return FLAT if any(e.model.sticks or remembers(e.data.plant) for e in problem.experiments) else 0.0
+    kinks = any(e.model.sticks or remembers(e.data.plant) for e in problem.experiments)
+    return FLAT if kinks or problem.find_smoothing() else 0.0
 
 
 def coarsen(problem: FitProblem, z: Vector) -> tuple[FitProblem, Evaluation]:
