@@ -558,10 +558,6 @@ INLINE void one_pass(const seaopt_pass_args *a, int wide) {
     deliver(q, a);
 }
 
-/* Apart from run_jobs, for inlined there its sums come in another order: the last digit decides which way a search that
-   is near the end of its budget goes. */
-ONCE void pass_states(const seaopt_pass_args *a) { one_pass(a, 1); }
-
 typedef struct { const seaopt_pass_args *list; long count; } jobs;
 
 static void *run_jobs(void *given) {
@@ -570,7 +566,7 @@ static void *run_jobs(void *given) {
     for (long i = 0; i < all->count; i++) {
         const seaopt_pass_args *one = all->list + i;
         if (MEASURED && (ALL == 1 || one->gram || one->columns || one->into.into)) one_pass(one, ALL);
-        else pass_states(one);
+        else one_pass(one, 1);
     }
     restore_denormals(mode);
     return 0;

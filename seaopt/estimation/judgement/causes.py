@@ -107,6 +107,8 @@ def find_causes(
     colour = measure_colour(fit.covariance, fit.white_covariance)
     causes = list(_weigh_hypotheses(fit, hypotheses, whole, colour))
     candidates = list(list_candidates(fit, minimum, residuals, suspects, alternatives, poor=poor, noticed=noticed))
+    if not poor:
+        candidates = _put_seen_first(candidates, suspects)
     # Steps as coarse as the residual allows, until a refit is worth finer ones.
     coarse, rough = minimum.problem, fitted
     if not _is_near_noise(fit) and not coarse.predicts:
@@ -128,14 +130,15 @@ def find_causes(
         try:
             with limit_evaluations(count_left() - kept):
                 steps = [(coarse, rough)]
-                seen = any(suspects[name].p < SEEN for name in candidate.frees if name in suspects)
-                if seen and coarse is not minimum.problem:
+                if _is_seen(candidate, suspects) and coarse is not minimum.problem:
                     steps.append((minimum.problem, fitted))  # what coarse steps hide, for it bends as they do
                 solved = next(_list_promising(fit, candidate, steps, measure_misfit(fitted), colour), None)
                 if solved is None:
                     continue
                 before = _measure_kept(fit, minimum.problem, minimum.z, candidate.kept) if candidate.kept else whole
                 solved = refine_to(solved, minimum.problem)
+                if count_left() < 1.0:  # cut off where it is, which is no minimum
+                    break
         except BudgetError:
             break
         except SeaoptError:  # what does not make a problem explains nothing
@@ -150,6 +153,25 @@ def find_causes(
     # Of explanations that chance alone sets apart, the one that frees least comes first.
     causes.sort(key=lambda c: (c.gain < best - ENOUGH, c.z.size if c.gain >= best - ENOUGH else 0, -c.gain))
     return _drop_worse(fit, causes)
+
+
+def _is_seen(candidate: Candidate, suspects: Mapping[str, ScoreTest]) -> bool:
+    """Tell whether a score is clearly against the value of something that a candidate frees."""
+    return any(suspects[name].p < SEEN for name in candidate.frees if name in suspects)
+
+
+def _put_seen_first(candidates: Sequence[Candidate], suspects: Mapping[str, ScoreTest]) -> list[Candidate]:
+    """Return the candidates with those in front that a score speaks for, and what follows them: where the budget ends
+    the search, it ends among what nothing speaks for.
+    """
+    groups: list[list[Candidate]] = []
+    for candidate in candidates:
+        if candidate.further:
+            groups[-1].append(candidate)
+        else:
+            groups.append([candidate])
+    groups.sort(key=lambda group: not _is_seen(group[0], suspects))
+    return [candidate for group in groups for candidate in group]
 
 
 def _drop_worse(fit: Fit, causes: list[Explanation]) -> list[Explanation]:

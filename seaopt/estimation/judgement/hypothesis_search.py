@@ -186,7 +186,7 @@ class _Search:
         single = list(self.try_each(problem, fitted, self.fit.experiments, self.fit.parameters))
         single.sort(key=lambda refit: (refit.undecided, refit.excess))
         gone_on = [*map(self.go_on, single[:BASES]), *single[BASES:]]
-        refits = sorted(gone_on, key=lambda refit: (refit.undecided, refit.excess))
+        refits = sorted(map(self.doubt, gone_on), key=lambda refit: (refit.undecided, refit.excess))
         bases = [refit for refit in refits[:BASES] if not refit.undecided]
         partners = [refit.change.hypotheses[-1] for refit in bases]
         # The best with each other first: of two effects either alone may take little.
@@ -213,12 +213,23 @@ class _Search:
         return _keep_best([*(refit for refit in refits if refit is not best), settled, *alone])
 
     def go_on(self, refit: Refit) -> Refit:
-        """Return a refit that has helped and was left before its minimum after as many rounds again."""
-        if refit.undecided or refit.at_minimum or refit.excess > (1.0 - self.helps) * self.first:
+        """Return a refit that is on its way to a minimum after as many rounds again."""
+        if refit.undecided or not self.is_on_its_way(refit):
             return refit
         start = refit.evaluation
         further = _descend(refit.change, refit.problem, start, self.base, self.base, self.helps, self.budget)
         return replace(further, evaluations=refit.evaluations + further.evaluations) if further else refit
+
+    def is_on_its_way(self, refit: Refit) -> bool:
+        """Tell whether a refit has helped and was left before its minimum."""
+        return not refit.at_minimum and refit.excess <= (1.0 - self.helps) * self.first
+
+    def doubt(self, refit: Refit) -> Refit:
+        """Return a refit as undecided where bristles leave an excess on their way to a minimum: how far they got before
+        they became too stiff is chance, and says nothing against them.
+        """
+        lost = has_bristles(refit.problem) and refit.excess > REMOVED and self.is_on_its_way(refit)
+        return replace(refit, undecided=refit.undecided or lost)
 
     def try_alone(self, pair: Refit) -> Iterator[Refit]:
         """Yield each part of a pair alone, from the pair's values: one of them may explain as much."""

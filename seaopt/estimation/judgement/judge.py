@@ -185,7 +185,7 @@ def _search_causes(
             progress=divide(progress, looking.spent, trying.evaluations)[1],
         )
         ended = ended or trying.left <= 0.0
-        named = list(_name_causes(fit, causes, suspects))
+        named = list(_name_causes(fit, causes, suspects, ended=ended))
         told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)
         rivals = _list_rivals(causes)
         refits = [cause.refit for cause in rivals]
@@ -491,14 +491,17 @@ def _list_rivals(causes: Sequence[Explanation]) -> list[Explanation]:
     return [cause for cause in causes if cause.gain > RIVAL_SHARE * causes[0].gain][:3]
 
 
-def _name_causes(fit: Fit, causes: Sequence[Explanation], suspects: Mapping[str, ScoreTest]) -> Iterator[FitFinding]:
-    """Yield the explanation that is the most likely, and others that explain as much."""
+def _name_causes(
+    fit: Fit, causes: Sequence[Explanation], suspects: Mapping[str, ScoreTest], *, ended: bool
+) -> Iterator[FitFinding]:
+    """Yield the explanation that is the most likely, and others that explain as much. `ended`: not all was tried."""
     against = next((name for name, test in suspects.items() if test.p < CHANCE), None)
     if not causes and against is not None:
         test = suspects[against]
+        tried = "the search for causes ended before all was tried" if ended else "no other value alone explains them"
         text = (
             f"{against} = {test.value:.4g} is fixed, and the logs are against it (chi-square {test.chi2:.3g} on one "
-            "degree of freedom), but no other value alone explains them"
+            f"degree of freedom), but {tried}"
         )
         yield _warn("fixed", against, text)
     if not causes:

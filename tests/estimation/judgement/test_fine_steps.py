@@ -54,6 +54,11 @@ def pose(log):
     return so.Experiment(plant=plant, log=log, outputs=("tau_s", "theta_m")), params
 
 
+def fit_log(log):
+    experiment, params = pose(log)
+    return so.fit([experiment], params)
+
+
 def test_only_what_gains_with_coarse_steps_is_refitted_with_fine_ones(log, monkeypatch):
     experiment, params = pose(log)
     refined = []
@@ -105,6 +110,16 @@ def test_what_takes_steps_out_of_proportion_is_not_decided(log, monkeypatch):
     assert fit.hypotheses[-1] is trial
     assert all(each.outcome != "undecided" for each in fit.hypotheses[:-1])
     assert so.Fit.from_dict(fit.to_dict(), ()).hypotheses == fit.hypotheses
+
+
+def test_no_last_digit_decides_what_is_named(log):
+    """How far bristles get before they are too stiff is chance, and so is what they leave of the budget to others."""
+    for seed in (1, 2, 8):
+        rng = np.random.default_rng(seed)
+        digits = {name: log[name] * (1.0 + 1e-12 * rng.uniform(-1.0, 1.0, len(log))) for name in log.signals}
+        fit = fit_log(so.Log.from_arrays(time=log.time, **digits))
+        assert [(one.kind, one.where) for one in fit.errors] == [("cause", "v_s"), ("excess", "experiment.theta_m")]
+        assert [trial.parts for trial in fit.hypotheses if trial.outcome == "undecided"] == [("lugre",)]
 
 
 def test_each_hypothesis_can_be_looked_at_in_the_least_budget():
