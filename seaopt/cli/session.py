@@ -374,7 +374,8 @@ class Session:
 
     def _explain(self, trial: HypothesisTrial, before: Fit, tell: Progress) -> Fit:
         """Return the fit of the problem with what explains its logs, which is the problem from here on."""
-        self.problem, lines = adopt(self.problem, trial)
+        starts = [finding.where for finding in before.errors if finding.kind == "initial"]
+        self.problem, lines = adopt(self.problem, trial, starts)
         self._experiments = None
         path = self.folder / EXPLAINED
         write_text(path, lines + "\n")

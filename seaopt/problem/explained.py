@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -65,10 +65,11 @@ def say_adopted(trial: HypothesisTrial) -> str:
     return f"explained: {trial.effect}: the residual is {after} times its sensor's noise in place of {before}"
 
 
-def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:
+def adopt(problem: Problem, trial: HypothesisTrial, starts: Collection[str] = ()) -> tuple[Problem, str]:
     """Return the problem with a hypothesis that was tried, and the lines of its file that are then other ones. The
-    parts go to every plant that is fitted, and its fit starts from the refit's values. Raises SeaoptError: a plant does
-    not take them.
+    parts go to every plant that is fitted, and its fit starts from the refit's values. `starts`: the experiments that
+    do not begin in the state that they state, with which free it was tried. Raises SeaoptError: a plant does not take
+    the parts.
     """
     content = problem.table.model_dump(by_alias=True, exclude_unset=True, mode="json")
     fitted = [table.plant for table in problem.table.experiment if table.use == "fit"]
@@ -85,6 +86,10 @@ def adopt(problem: Problem, trial: HypothesisTrial) -> tuple[Problem, str]:
     }
     content["parameters"] = {**content.get("parameters", {}), **values}
     lines += ["[parameters]", *(f"{name} = {_write(value)}" for name, value in values.items())]
+    for experiment, row in zip(problem.table.experiment, content["experiment"], strict=True):
+        if experiment.name in starts:
+            row["initial_state"] = "estimate"
+            lines += ["[[experiment]]", f'name = "{experiment.name}"', 'initial_state = "estimate"']
     table = check_table(ProblemTable, content, problem.source, error=ProblemError)
     made = make_problem(table, problem.source, problem.folder)
     start = {name: value for name, value in trial.parameters.items() if name in made.parameters}

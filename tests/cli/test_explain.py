@@ -60,6 +60,18 @@ def test_bristles_are_added_to_a_plant_that_sticks(problem):
     assert tomllib.loads(lines)["plant"]["stand"] == {"parts": ["lugre"], "sticks": False}
 
 
+def test_a_start_with_which_free_a_cause_was_found_is_freed_with_it(problem):
+    trial = HypothesisTrial(
+        effect="the spring hardens", parts=("hardening",), outcome="adopted", excess_before=9.0, excess=1.0,
+        frees={"k_3": 8.0}, fixed={}, parameters={}, evaluations=9,
+    )  # fmt: skip
+    same, lines = adopt(read_problem(problem), trial)
+    assert same.table.experiment[0].initial_state == "rest" and "experiment" not in tomllib.loads(lines)
+    found, lines = adopt(read_problem(problem), trial, ["log"])
+    assert found.table.experiment[0].initial_state == "estimate"
+    assert tomllib.loads(lines)["experiment"] == [{"name": "log", "initial_state": "estimate"}]
+
+
 def test_what_nothing_explains_is_said():
     trial = HypothesisTrial(
         effect="the spring hardens", parts=("hardening",), outcome="tried", excess_before=30.0, excess=20.0,

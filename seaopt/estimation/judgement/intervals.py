@@ -153,7 +153,7 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
     stated = {e.name for e in problem.experiments if e.data.initial_state != "estimate"}
     if not stated or fit.status != "converged":
         return
-    freed, at, states = _free_starts(minimum, stated)
+    freed, at, states = free_starts(minimum, stated)
     first = freed.evaluate(at)
     if not np.all(np.isfinite(first.hessian)):
         return
@@ -190,7 +190,7 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
         )
 
 
-def _free_starts(minimum: Minimum, stated: Collection[str]) -> tuple[FitProblem, Vector, dict[str, int]]:
+def free_starts(minimum: Minimum, stated: Collection[str]) -> tuple[FitProblem, Vector, dict[str, int]]:
     """Return the problem with the states free in which some experiments begin, the minimum in it, and how many states
     of each are free.
     """

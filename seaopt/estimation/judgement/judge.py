@@ -13,7 +13,8 @@ such a fit are not what it says.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,18 +30,21 @@ from seaopt.estimation.judgement.intervals import (
     find_single_event,
     find_step_error,
     find_wrong_starts,
+    free_starts,
 )
 from seaopt.estimation.judgement.score_test import Freed, ScoreTest, free_fixed, run_score_tests
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
 from seaopt.estimation.judgement.silence import find_silent
 from seaopt.estimation.problem.experiment import Experiment
-from seaopt.estimation.problem.fit_problem import limit_evaluations
+from seaopt.estimation.problem.fit_problem import BudgetError, limit_evaluations
 from seaopt.estimation.problem.noise_floor import NoiseFloor, measure_floors
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.result.findings import FitFinding, OutputFit, find_ended_search, find_energy, order_findings
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
+from seaopt.estimation.result.summary import summarise
+from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.estimation.result.widening import widen
 from seaopt.estimation.solver.budget import EVALUATIONS, EvaluationBudget
 from seaopt.estimation.solver.least_squares import find_blocked
@@ -152,8 +156,10 @@ def _search_causes(
     """Return the fit with intervals that reach to what explains it as well, its findings with the causes that are
     named, and what became of each hypothesis. `findings`: those yet; `evaluations`: those of a share of the budget.
     """
-    if any(finding.kind == "initial" and finding.severity == "error" for finding in findings):
-        return fit, findings, TriedHypotheses()  # what is left of a transient looks like much else
+    wrong = {finding.where for finding in findings if finding.kind == "initial" and finding.severity == "error"}
+    if wrong:
+        found, trials = _judge_with_free_starts(fit, wrong, alternatives, budget, progress)
+        return fit, [*findings, *found], TriedHypotheses(trials=trials)
     noticed = (
         any(ratio > FAR for ratio in error.excess.values())  # noise of a colour is so, too
         or any(finding.severity != "note" for finding in findings)
@@ -197,6 +203,27 @@ def _search_causes(
         findings += named
         search = search if not causes or causes[0].refit is not None else search.yield_to_another()
     return fit, [*findings, *([find_ended_search(budget.evaluations)] if ended else [])], search
+
+
+def _judge_with_free_starts(
+    fit: Fit, names: Collection[str], alternatives: Sequence[Plant], budget: EvaluationBudget, progress: Progress
+) -> tuple[list[FitFinding], tuple[HypothesisTrial, ...]]:
+    """Return the causes that are named with the states free in which experiments of these names begin, for what is left
+    of a transient looks like much else, and the hypotheses that are tried then.
+    """
+    minimum = fit.require_minimum("_judge_with_free_starts")
+    freed, at, _ = free_starts(minimum, names)
+    try:
+        solved = minimum.method.go_on(freed, at, None)
+        if solved is None:
+            return [], ()
+        other = summarise(solved, minimum.method, True, time.perf_counter())
+        judged = judge(other, alternatives, progress, evaluations=int(budget.left / (OF_HYPOTHESES + OF_CAUSES + 1)))
+    except BudgetError:
+        return [find_ended_search(budget.evaluations)], ()
+    begins = f"with the state free in which {join_words(sorted(names))} begins: "
+    named = [replace(each, text=begins + each.text) for each in judged.findings if each.kind in ("cause", "fixed")]
+    return [*named, *(each for each in judged.findings if each.kind == "budget")], judged.hypotheses
 
 
 def _hangs_on_little(fit: Fit, findings: Sequence[FitFinding]) -> bool:

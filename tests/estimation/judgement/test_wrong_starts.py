@@ -5,6 +5,8 @@ import pytest
 from scipy.linalg import expm
 
 import seaopt as so
+from seaopt.estimation.problem.fit_problem import count_evaluations
+from seaopt.estimation.solver.budget import EVALUATIONS
 
 RATE_HZ, N, K_TAU, SUBSTEPS = 500.0, 50.0, 0.07, 20
 TRUTH = {"J_m": 4e-5, "b_r": 1e-3, "k_s": 300.0}
@@ -65,6 +67,18 @@ def test_a_log_that_begins_in_motion_is_not_met_as_one_that_rested(friction):
 
 def test_a_wrong_position_is_noticed_as_a_wrong_speed_is():
     assert find_initial(fit(record(2), initial_state={"theta_m": 0.3}))[0].severity == "error"
+
+
+def test_what_the_model_lacks_is_named_beside_a_wrong_start():
+    """A position that is stated wrongly hides friction of 5 mN m, which the model has not."""
+    before = count_evaluations()
+    wrong = fit(record(1, lead_s=2.0, friction=0.005), initial_state={"theta_m": 1.0})
+    assert find_initial(wrong)[0].severity == "error" and not wrong.met
+    (cause,) = (finding for finding in wrong.findings if finding.kind == "cause")
+    assert cause.where == "f_c" and cause.text.startswith("with the state free in which chirp begins: ")
+    assert cause.preferred["f_c"][0] == pytest.approx(0.005, rel=0.02)
+    assert wrong.hypotheses
+    assert count_evaluations() - before < 2 * 6 * EVALUATIONS  # of a fit and its judgement
 
 
 def test_a_little_motion_at_the_start_is_noticed_under_much_noise():
