@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,6 +43,14 @@ def test_the_stages_lead_up_to_the_full_law_and_each_is_certified(plan, controll
     assert [stage.controller.spec.bandwidth_hz for stage in plan.stages] == [7.5, 15.0, 30.0]
     assert plan.met and plan.stages[-1].controller is controller
     assert all(stage.certificate.controller is stage.controller for stage in plan.stages)
+
+
+def test_a_stage_whose_law_is_not_certified_says_on_what(plan):
+    first, *others = plan.stages
+    rows = [replace(row, met=row.name != "max_sensitivity") for row in first.certificate.requirements]
+    failed = replace(first, certificate=replace(first.certificate, requirements=tuple(rows)))
+    text = " ".join(repr(replace(plan, stages=(failed, *others))).split())
+    assert text.startswith("not met") and "its law failed, on max_sensitivity: stage_1" in text
 
 
 def test_stages_before_the_last_leave_out_the_sweeps_of_which_nothing_is_required(plan):

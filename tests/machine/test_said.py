@@ -86,6 +86,22 @@ def test_no_periods_are_asked_for_where_friction_is_what_differs(judged, name, s
     assert f"bandwidth: {says}" in reason and never not in reason
 
 
+def test_no_periods_are_asked_for_where_a_sensor_is_at_its_range(judged):
+    """Nineteen of them were, of a log that has eighteen: more would be clipped as well."""
+    _, result = judged
+    rows = [
+        replace(row, outcome="undecided", periods=19) if row.name == "bandwidth" else row
+        for row in result.response.judged
+    ]
+    clipped = Difference(kind="range", name="F1", value=60.0, low=None, high=None, unit="N", explains=1.0)
+    differences = replace(result.differences, inside=False, found=(clipped,))
+    other = replace(result, response=replace(result.response, judged=tuple(rows)), differences=differences)
+    first, reason = (each.what for each in judge(other, Commands()).reasons)
+    assert first == "F1 stops at 60 N: its sensor is at its range" and "19 periods" not in reason
+    assert "bandwidth: record again with the readings within the range of their sensor" in reason
+    assert read_row(other, "bandwidth")["would decide"] == ""
+
+
 def read_row(result, name):
     """Return the cells of a figure's row in the printed table."""
     (table,) = next(each for each in describe(result) if each.part == "response").tables

@@ -57,12 +57,17 @@ def judge(result: BringUp, commands: Commands) -> Verdict | None:
     """Return the verdict: whether the law of every stage is certified."""
     good = [stage for stage in result.stages if stage.certificate.met]
     reasons = tuple(
-        Reason(what="the certificate of its law failed", where=stage.name)
+        Reason(what=f"the certificate of its law failed, on {join_words(_list_broken(stage))}", where=stage.name)
         for stage in result.stages
         if not stage.certificate.met
     )
     text = f"Bring-up: {len(good)} of {format_count(len(result.stages), 'stage')} with a certified law"
     return Verdict(met=result.met, text=text, reasons=reasons)
+
+
+def _list_broken(stage: Stage) -> list[str]:
+    """Return the names of the requirements that a stage's certificate does not meet."""
+    return [*dict.fromkeys(row.name for row in stage.certificate.requirements if not row.met)]
 
 
 OUTER = (

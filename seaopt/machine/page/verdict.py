@@ -148,7 +148,9 @@ def say_undecided(result: Acceptance, response: Response) -> str:
         record.append(f"{LEAST_PHASES} sets of random phases{below}, which dry friction asks for")
     if response.needs_lines is not None:
         record.append(say_missing(response.needs_lines, response.missing))
-    periods = 0 if tripped or refuted else max((row.periods or 0 for row in rows), default=0)
+    if clipped := _is_clipped(result):
+        record.append("again with the readings within the range of their sensor")
+    periods = 0 if tripped or refuted or clipped else max((row.periods or 0 for row in rows), default=0)
     if rows and not tripped and _rubs(result):
         record.append(LARGER)
     elif periods:
@@ -157,6 +159,11 @@ def say_undecided(result: Acceptance, response: Response) -> str:
     first = "mend what is refuted first, then " if refuted else ""
     others = [f"{join_words([name_figure(row) for row in rows])}: {first}record {wanted}"] if rows else []
     return "; ".join([*others, *near])
+
+
+def _is_clipped(result: Acceptance) -> bool:
+    """Tell whether a sensor is at its range, so that the response has that in it, whatever the periods."""
+    return result.differences is not None and any(each.kind == "range" for each in result.differences.found)
 
 
 def _rubs(result: Acceptance) -> bool:
@@ -186,7 +193,7 @@ def _say_where(row: Judged) -> str:
 def say_needed(result: Acceptance, row: Judged) -> str:
     """Return what would decide a figure, or tell a margin, in a cell: periods, where they can be recorded."""
     assert result.response is not None
-    if row.periods is None:
+    if row.periods is None or _is_clipped(result):
         return ""
     if row.periods * result.response.period_s > LONGEST or (row.limit is not None and _rubs(result)):
         return f"a larger amplitude{_say_where(row)}"
