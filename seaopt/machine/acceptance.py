@@ -411,13 +411,12 @@ def list_ticks(
     whole: bool = False,
 ) -> list[Ticks]:
     """Return the ticks of logs. Raises LogError: those of a schedule stand at different values, or at none of it."""
-    over = source.over if isinstance(source, ScheduledController) else None
     if at is not None:
         require_number(at, "at", LogError)
-        if over is None:
+        if source.over is None:
             raise LogError(f"at = {at:g}: the law is not scheduled; leave it out")
     law = stand(source, at)
-    rows = [take_ticks(law, log, reference, over, at, before=before, whole=whole) for log in logs]
+    rows = [take_ticks(law, log, reference, source.over, at, before=before, whole=whole) for log in logs]
     if not isinstance(source, ScheduledController):
         return rows
     low, high = source.points[0], source.points[-1]
@@ -426,12 +425,12 @@ def list_ticks(
     for middle in middles:
         if not low - near <= middle <= high + near:
             raise LogError(
-                f"{over} is {middle:g}, and the schedule is from {low:g} to {high:g}{unit_after(source.unit)}; check "
-                "the column and its unit, or give --at VALUE"
+                f"{source.over} is {middle:g}, and the schedule is from {low:g} to {high:g}{unit_after(source.unit)}; "
+                "check the column and its unit, or give --at VALUE"
             )
     if max(middles) - min(middles) > near:
         values = join_words([f"{value:.4g}" for value in sorted(set(middles))])
-        raise LogError(f"the logs have {over} at {values}; accept those of each value by themselves")
+        raise LogError(f"the logs have {source.over} at {values}; accept those of each value by themselves")
     return rows
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -58,9 +58,13 @@ _UNKNOWN = LoopFigures(stable=False, spectral_radius=np.nan)
 
 
 class ClosesLoops(LoopDelays):
-    """What a law and a plan have in common: the loop around a plant, from what is read to the effort commanded."""
+    """What a law and a plan have in common: the loop around a plant, from what is read to the effort commanded; and
+    that neither is scheduled: over nothing, and tuned at no place.
+    """
 
     __slots__ = ()
+    over: ClassVar[None] = None
+    points: ClassVar[tuple[None]] = (None,)
     law: Any
     per_effort: Any
 

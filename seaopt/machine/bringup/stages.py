@@ -79,7 +79,7 @@ class Stage(Expected):
     def channels(self) -> tuple[str, ...]:
         """What to log in each tick."""
         controller, source = self.controller, self.source
-        over = (source.over,) if isinstance(source, ScheduledController) else ()
+        over = () if source.over is None else (source.over,)
         return tuple(
             dict.fromkeys((REFERENCE, *controller.signals, *controller.further, *over, controller.command.input))
         )
@@ -250,16 +250,14 @@ def bring_up(
     certifying, tuning = certify_stage or certify_one, tune_stage or tune_one
     of_law, of_link = split_limits(stand(controller, None), limits or {}, link)
     options: dict[str, Any] = {"share": share, "bias": bias, "limits": of_law, "seed": seed, "sensors": sensors}
-    over = controller.over if isinstance(controller, ScheduledController) else None
-    inside = {name: ends for name, ends in (ranges or {}).items() if name != over}
+    inside = {name: ends for name, ends in (ranges or {}).items() if name != controller.over}
 
     def draw(law: Controller) -> list[dict[str, float]]:
         drawn = list_draws(law, uncertainty, inside, DRAWS, seed)
-        return [{name: value for name, value in each.items() if name != over} for each in drawn]
+        return [{name: value for name, value in each.items() if name != controller.over} for each in drawn]
 
     draws = draw(stand(controller, None))
-    places = controller.points if isinstance(controller, ScheduledController) else (None,)
-    stages, count = list[Stage](), len(fractions) + len(places)
+    stages, count = list[Stage](), len(fractions) + len(controller.points)
 
     def keep(stage: Stage) -> None:
         stages.append(stage)
@@ -270,17 +268,18 @@ def bring_up(
         progress(f"stage {len(stages) + 1} of {count}, {text}", len(stages) / count)
 
     for number, fraction in enumerate(sorted(fractions), start=1):
-        part = options | {"share": share * fraction, "most": share, "place": places[0]}
+        part = options | {"share": share * fraction, "most": share, "place": controller.points[0]}
         law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell, part)
         keep(_make_stage(f"stage_{number}", law, judged, note, draws, part))
     if certificate is None:
         tell("certifying the law itself")
         certificate = certifying(controller)
-    for number, place in enumerate(places, start=1):
-        name = FULL if len(places) == 1 else f"{FULL}_{number}"
+    for number, place in enumerate(controller.points, start=1):
+        name = FULL if len(controller.points) == 1 else f"{FULL}_{number}"
         stage = _make_stage(name, controller, certificate, "", draws, options | {"most": share, "place": place})
         outer = stage.controller.outer
-        enclosed = enclose_link(stage.controller, link, None if over is None or place is None else (over, place))
+        at = None if controller.over is None or place is None else (controller.over, place)
+        enclosed = enclose_link(stage.controller, link, at)
         if outer is not None and link is not None and enclosed is None:
             stage = replace(stage, outer_unstable=True)
         if outer is not None and enclosed is not None:

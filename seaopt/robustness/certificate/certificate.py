@@ -264,8 +264,9 @@ class Certificate(Result, Worded):
         >>> coarse.passed, len(coarse.simulated.verification.rows)
         (True, 7)
         """
-        if self.schedule is not None:
-            raise ControlError("a schedule is simulated by certify alone; give certify sensors and command_step")
+        if self.schedule is not None or self.constrained is not None:
+            whose = "a schedule" if self.schedule is not None else "predictive control"
+            raise ControlError(f"{whose} is simulated by certify alone; give certify sensors and command_step")
         if not self.models:
             raise ControlError("nothing can be simulated without a model; design the controller on one")
         simulated = run_simulations(

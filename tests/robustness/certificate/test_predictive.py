@@ -225,10 +225,12 @@ def test_it_comes_back_from_its_file(certificate, mpc, stand, thor):
     assert again.constrained == certificate.constrained and again.passed
 
 
-def test_what_cannot_be_is_said_in_one_line(mpc, stand, thor):
+def test_what_cannot_be_is_said_in_one_line(certificate, mpc, stand, thor):
     for options, said in (({"runs": 0}, "runs = 0"), ({"bound_tolerance": -1.0}, "bound_tolerance = -1")):
         with pytest.raises(ControlError, match=said):
             so.certify(mpc, {"stand": stand}, thor, **options)
+    with pytest.raises(ControlError, match="predictive control is simulated by certify alone"):
+        certificate.with_simulation()
 
 
 @pytest.mark.parametrize("stiffness", [40.0, 0.0])

@@ -107,8 +107,7 @@ def look_at_draws(
     if not first.unknown.size:
         return {}
     points = first.unknown.draw(LOOKED_AT, np.random.default_rng(LOOK_STREAM))
-    tuned_at = law.points if isinstance(law, ScheduledController) else (None,)
-    tuned = [each for value, each in posed.items() if value in tuned_at]
+    tuned = [each for value, each in posed.items() if value in law.points]
     return {name: _look_at_plant(cases, tuned, name, points) for name in first.plants}
 
 
