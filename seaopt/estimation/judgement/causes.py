@@ -1,7 +1,8 @@
 """Explanations of the logs that are better than a fit's: each candidate is refitted, and weighed by what it gains.
 
 What a candidate gains is the logarithm of its likelihood over the fit's, at each one's own residuals. The gain counts
-only beyond what chance gives a residual of this colour.
+only beyond what chance gives a residual of this colour. The search may end before all was tried: so what a score speaks
+for is tried first, and a refit that the budget cuts off is not compared with any.
 """
 
 from __future__ import annotations

@@ -11,8 +11,9 @@ be taken alone it has to remove all of the excess that is left.
 
 What this may cost is counted (`budget`): refits begin as long as the search's share lasts, and the best of them is
 settled, and parted where it is a pair, from what the whole judgement has left. A refit that asks for integration steps
-out of proportion to the fit's is left undecided: bristles that slip fast are so stiff, and their search often ends in
-no minimum. So is a pair whose parts are not tried because nothing is left.
+out of proportion to the fit's is left undecided: bristles that slip fast are so stiff. Their search often ends in no
+minimum, and where they still leave an excess is undecided, too. So is a pair whose parts are not tried because nothing
+is left.
 """
 
 from __future__ import annotations
