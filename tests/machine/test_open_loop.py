@@ -33,8 +33,13 @@ def play(current, reference, noise=2.0, decimals=2, seed=1):
     return so.Log.from_arrays(time=1e-3 * np.arange(current.size), F1=np.round(force, decimals), **columns)
 
 
-@pytest.mark.parametrize("reference", REFERENCES)
-@pytest.mark.parametrize("played", PLAYED)
+PAIRS = [(played, reference) for played in PLAYED for reference in REFERENCES]
+TELLING = {("multisine", "rest"), ("chirp", "another"), ("steps", "what was played"), ("noise", "rest")}
+
+
+@pytest.mark.parametrize(
+    ("played", "reference"), [pytest.param(*pair, marks=[pytest.mark.slow] * (pair not in TELLING)) for pair in PAIRS]
+)
 def test_a_command_that_was_played_without_the_law_is_an_open_loop(controller, played, reference):
     log = play(PLAYED[played], REFERENCES[reference])
     result = so.accept(controller, [log])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -39,13 +40,24 @@ CASES = [("pid", RUBS, moved) for moved in MOVED] + [("pd", {}, MOVED[0]), ("pid
 SLOW = [("pid", {}, moved) for moved in MOVED] + [("pid_dob", RUBS, moved) for moved in MOVED]
 
 
+@pytest.fixture(scope="module")
+def neighbours(stand, thor):
+    """Return a function that gives the law of a structure, and of friction, before a limit is moved."""
+
+    @cache
+    def tune(structure: str, rubs: tuple[tuple[str, float], ...]) -> so.Controller:
+        spec = so.ControllerSpec(structure=structure, bandwidth_hz=20.0, **LIMITS)
+        return so.tune(stand, thor.update(**dict(rubs)), spec)
+
+    return tune
+
+
 @pytest.mark.parametrize(
     ("structure", "rubs", "moved"), [*CASES, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
 )
-def test_a_moved_limit_has_the_law_of_a_whole_search(structure, rubs, moved, stand, thor, request):
-    params = thor.update(**rubs)
-    spec = so.ControllerSpec(structure=structure, bandwidth_hz=20.0, **LIMITS)
-    neighbour = so.tune(stand, params, spec)
+def test_a_moved_limit_has_the_law_of_a_whole_search(structure, rubs, moved, stand, thor, neighbours, request):
+    params, neighbour = thor.update(**rubs), neighbours(structure, tuple(rubs.items()))
+    spec = neighbour.spec
     asked = replace(spec, **moved)
     whole = so.tune(stand, params, asked)
     request.getfixturevalue("no_scan")
