@@ -338,7 +338,9 @@ class Inputs:
 
 def take_weights(law: RunnableLaw) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, " k"]]:
     """Return with which weights a law's states and its effort take the reference and the readings."""
-    weights = np.column_stack([law.b_reference, -np.reshape(law.b_measurement, (law.c.size, -1))])
+    weights = np.column_stack(
+        [law.b_reference, -np.reshape(law.b_measurement, (law.c.size, np.size(law.d_measurement)))]
+    )
     return weights, np.append(law.d_reference, -np.ravel(law.d_measurement))
 
 
