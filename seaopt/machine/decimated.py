@@ -42,7 +42,8 @@ from seaopt.control.loops.moved_link import enclose_law
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.errors import LogError
 from seaopt.logs.quality.faults import find_quantisation
-from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open, list_parts, name_factor
+from seaopt.machine.alternatives import list_parts, name_factor
+from seaopt.machine.causes import MOST_CAUSES, SHORT, Cause, leave_open
 from seaopt.machine.response.enclosed import take_given
 from seaopt.machine.response.periods import Blocks, cut_periods
 from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction

@@ -33,7 +33,8 @@ from jaxtyping import Complex, Float
 
 from seaopt.control import RunnableLaw
 from seaopt.logs.quality.faults import find_quantisation
-from seaopt.machine.causes import Alternative, Cause, list_others, list_parts
+from seaopt.machine.alternatives import Alternative, list_others, list_parts
+from seaopt.machine.causes import Cause
 from seaopt.machine.gains.free_gains import make_law
 from seaopt.machine.response.periods import find_period
 from seaopt.machine.stepped import (

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from seaopt.control import Controller
 from seaopt.formatting import format_number, join_words
-from seaopt.machine.causes import Cause, Edited, EditedGain
+from seaopt.machine.alternatives import Edited, EditedGain
+from seaopt.machine.causes import Cause
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.gains.free_gains import SAME_GAINS
