@@ -8,45 +8,21 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.control import Gains
 from seaopt.machine.gains.free_gains import make_law
 from seaopt.machine.hidden import Segments, find_hidden, respond
 from seaopt.machine.stepped import make_setting, play
 from seaopt.machine.ticks import take_ticks
-from tests.machine.simulator import Bench, Machine, multisine
+from tests.machine.simulator import Bench, multisine
 
-SPEC = so.ControllerSpec(
-    bandwidth_hz=20,
-    structure="pid_dob",
-    measured="tau_s",
-    max_sensitivity=1.6,
-    max_noise_gain=45,
-    current_limit_A=9.0,
-)
-STATED = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "f_c": 0.005, "v_s": 1.0, "k_s": 300.0}
-GAINS = {
-    "k_p": 3.5967254, "k_i": 53.649854, "k_d": 0.10047331, "T_f": 1.9399547e-3, "k_r": 4.4688964, "c": 0.40760695
-}  # fmt: skip
 LINES = np.unique(np.round(np.geomspace(1, 60, 25)).astype(int))
 REFERENCE = multisine(1000, LINES, 20, 1.0, 3) + 4.0 * np.sin(2e-4 * np.pi * np.arange(20000))
 
 
 @pytest.fixture(scope="module")
-def knee():
-    plant = so.plants.rotary(link="locked")
-    values = plant.complete(so.ParameterSet()).update(**STATED)
-    law = so.tune(plant, values, SPEC)
-    observer = replace(law.observer, T_q=2.9989379)  # a slower one tells little in 20 s
-    gains = Gains.from_names(GAINS, observer)
-    made = gains.law("pid_dob", 1e-3).balanced()
-    return replace(law, law=made, gains=gains.by_name(), observer=observer), Machine.of_knee(values)
-
-
-@pytest.fixture(scope="module")
-def benches(compiler, tmp_path_factory, knee):
+def benches(compiler, tmp_path_factory, observed):
     """Return those of the law, of it without its observer, and of it with a k_p that is 0.3 % smaller."""
-    law, folder = knee[0], tmp_path_factory.mktemp("knee")
-    gains, spec = law.read_gains(), replace(SPEC, structure="custom")
+    law, folder = observed[0], tmp_path_factory.mktemp("knee")
+    gains, spec = law.read_gains(), replace(law.spec, structure="custom")
 
     def make(name, **changes):
         made = replace(gains, **changes).law("pid_dob", 1e-3).balanced()
@@ -59,8 +35,8 @@ def record(bench, machine, seed, decimals=3, noise=0.02):
     return bench.log(machine, REFERENCE, noise=noise, seed=seed, decimals=decimals).between(0.3, 19.9)
 
 
-def test_responses_are_those_of_the_law(knee):
-    law = knee[0]
+def test_responses_are_those_of_the_law(observed):
+    law = observed[0]
     f = np.geomspace(1e-3, 0.45, 50)
     setting = make_setting(law, take_ticks(law, so.Log.from_arrays(**_ramp(law))))
     forward, *feedback = respond(setting.linear, f)
@@ -75,8 +51,8 @@ def _ramp(law):
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_a_missing_observer_is_told_below_the_rounding_of_every_tick(knee, benches, seed):
-    law, machine = knee
+def test_a_missing_observer_is_told_below_the_rounding_of_every_tick(observed, benches, seed):
+    law, machine = observed
     log = record(benches["bare"], machine, seed)
     result = so.accept(law, [log])
     cause = result.replays[0].causes[0]
@@ -86,9 +62,9 @@ def test_a_missing_observer_is_told_below_the_rounding_of_every_tick(knee, bench
     assert "stands out of the rounding of the whole log by" in " ".join(str(result).split())
 
 
-def test_shares_are_as_the_rounding_of_a_right_law_scatters_them(knee, benches):
+def test_shares_are_as_the_rounding_of_a_right_law_scatters_them(observed, benches):
     """That of the observer, in logs whose rounding is drawn anew: zero, with the std that is stated."""
-    law, machine = knee
+    law, machine = observed
     bare = make_law(law, replace(law.read_gains(), observer=None))
     scores = []
     for seed in range(12):
@@ -101,9 +77,9 @@ def test_shares_are_as_the_rounding_of_a_right_law_scatters_them(knee, benches):
     assert np.max(np.abs(scores)) < 4.0 and 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.6, scores
 
 
-def test_the_rounding_of_a_reference_that_repeats_is_the_same_each_time(knee, benches):
+def test_the_rounding_of_a_reference_that_repeats_is_the_same_each_time(observed, benches):
     """Twenty times the same errors are no twenty times as many: such shares were said to stand out by 6 to 10 std."""
-    law, machine = knee
+    law, machine = observed
     bare = make_law(law, replace(law.read_gains(), observer=None))
     scores = []
     for seed in range(8):
@@ -117,26 +93,26 @@ def test_the_rounding_of_a_reference_that_repeats_is_the_same_each_time(knee, be
     assert np.max(np.abs(scores)) < 4.0, scores
 
 
-def test_a_gain_that_is_a_little_off_has_its_size(knee, benches):
-    law, machine = knee
+def test_a_gain_that_is_a_little_off_has_its_size(observed, benches):
+    law, machine = observed
     (row,) = so.accept(law, [record(benches["weak"], machine, 1, decimals=2)]).replays
     cause = row.causes[0]
     assert not row.met and (cause.kind, cause.what) == ("gain", "k_p")
     assert cause.value == pytest.approx(0.997 * law.gains["k_p"], rel=1e-3)
 
 
-def test_counts_that_hide_the_noise_tell_nothing(knee, benches):
+def test_counts_that_hide_the_noise_tell_nothing(observed, benches):
     """Rounding that goes with the signal is no noise, and looks like other laws."""
-    law, machine = knee
+    law, machine = observed
     ticks = take_ticks(law, record(benches["law"], machine, 1, decimals=0, noise=0.01))
     setting = make_setting(law, ticks)
     assert find_hidden(setting, play(setting), {}) == ()
 
 
 @pytest.mark.parametrize("decimals", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_the_mean_of_a_references_rounding_that_repeats_is_not_another_law(knee, benches, decimals):
+def test_the_mean_of_a_references_rounding_that_repeats_is_not_another_law(observed, benches, decimals):
     """Over sixty periods it runs up in two integrals to many times what rounding makes at random."""
-    law, machine = knee
+    law, machine = observed
     periodic = multisine(1000, LINES, 60, 1.0, 1)
     met = {}
     for name in ("law", "weak"):

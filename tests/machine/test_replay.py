@@ -408,22 +408,17 @@ def test_a_log_of_every_second_tick_of_a_loop_that_ran_away_is_no_proof_of_anyth
 
 
 @pytest.mark.slow
-def test_a_part_that_the_whole_log_alone_tells_is_named(compiler, tmp_path):
+def test_a_part_that_the_whole_log_alone_tells_is_named(observed, compiler, tmp_path):
     """An observer of 3 s with a hundredth of the command: where readings are rounded, a state at the first row of a
     window makes up for it there.
     """
-    plant = so.plants.rotary(link="locked")
-    stated = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "f_c": 5e-3, "v_s": 1.0, "k_s": 300.0}
-    values = plant.complete(so.ParameterSet()).update(**stated)
-    limits = {"max_sensitivity": 1.6, "max_noise_gain": 45, "current_limit_A": 9.0}
-    law = so.tune(plant, values, so.ControllerSpec(bandwidth_hz=20, structure="pid_dob", measured="tau_s", **limits))
-    gains = replace(Gains.from_names(law.gains, law.observer, law.speed_loop, law.link), observer=None)
+    law, machine = observed
+    gains = replace(law.read_gains(), observer=None)
     without = gains.law("pid_dob", law.sample_time_s).balanced()
     bare = replace(law, law=without, structure="custom", gains={}, spec=replace(law.spec, structure="custom"))
     bench = Bench(compiler, tmp_path, bare)
     options = {"share": 0.5, "bias": 0.0, "phases": 6, "periods": 4, "limits": {"tau_s": 20.0}}
     played = design_excitation(law, **options, seed=1).reference
-    machine = Machine.of_knee(values)
     log = bench.log(replace(machine, coulomb=1.2 * machine.coulomb), played, noise=0.03, decimals=3).between(0.3, 1e3)
     (row,) = so.accept(law, [log]).replays
     assert not row.met and 2.0 < row.mismatch / row.allowed < 3.0
