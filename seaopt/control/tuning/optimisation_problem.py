@@ -113,10 +113,10 @@ from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 
 OBJECTIVE_HZ = 0.1  # disturbances count from here
-NO_LIMIT = 1e9
-NO_FLOOR = 1e-9
+NO_LIMIT, NO_FLOOR = 1e9, 1e-9
 NO_FLOOR_FILTERED = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
 NEARLY_KEPT = 1.001
+ALONE_S = 3.0  # the slowest observer that is the law's only integral: what a constant load does leaves as slowly
 NEXT_TO_NO_NOISE = 1e-9  # N/N, of a law without feedback: the objective's logarithm is taken
 LOWEST_NOTCH = 1.2  # of the bandwidth: one at the bandwidth would make it by a dip
 LOWEST_PREFILTER = 0.3  # of the bandwidth
@@ -282,7 +282,7 @@ class Task:
             free if spec.reference_weights != "error" else fixed,
             free if self.speed_loop is not None else fixed,
             (fastest, max(fastest, 4.0 / (2 * np.pi * spec.bandwidth_hz))),
-            (0.2 * ts, self.slowest_observer_s) if self.nominal is not None else unused,
+            (0.2 * ts, self.slowest_observer_s if integrates else ALONE_S) if self.nominal is not None else unused,
             (SLOWEST_SPEED_RATE, 1.0 / ts) if self.speed_loop is not None and x[SPEED_RATE] > 0.0 else fixed,
             *notch, *prefilter,
         ]  # fmt: skip

@@ -154,6 +154,8 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
     if not stated or fit.status != "converged":
         return
     freed, at, states = free_starts(minimum, stated)
+    if not any(states.values()):  # the fit's band has forgotten how they begin
+        return
     first = freed.evaluate(at)
     if not np.all(np.isfinite(first.hessian)):
         return
@@ -166,7 +168,7 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
     colour = measure_colour(fit.covariance, fit.white_covariance)
     for experiment in problem.experiments:
         name, sizes = experiment.name, experiment.sigma / np.maximum(experiment.spread, 1e-300)
-        if name not in stated:
+        if not states.get(name):
             continue
         before, after = fitted[name].rms, best.power[name].rms
         falls = np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))

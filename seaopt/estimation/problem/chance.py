@@ -15,12 +15,14 @@ TINY = 1e-300  # in place of a denominator of zero
 
 def exceeds(shape: float, x: float) -> float:
     """Return the probability that a gamma variable of this shape (and scale 1) exceeds x; of 2 `shape` degrees of
-    freedom that chi-square exceeds 2 x.
+    freedom that chi-square exceeds 2 x. One of shape 0 is 0.
     """
     if math.isnan(x):
         return math.nan
     if x <= 0.0:
         return 1.0
+    if shape <= 0.0:
+        return 0.0
     front = math.exp(shape * math.log(x) - x - math.lgamma(shape)) if math.isfinite(x) else 0.0
     if x < shape + 1.0:
         return 1.0 - front * _sum_series(shape, x)

@@ -55,6 +55,8 @@ def test_it_is_never_worse_than_the_law_without(values):
         )  # fmt: skip
         law = so.tune(stand, params, spec, robust_to={"swing": swing})
         assert law.met
+        slow = law.gains.get("T_q", 0.0) > 3.0 * (1.0 + 1e-9)
+        assert not slow or law.gains["k_i"] > 0.0  # or a constant load would leave as slowly
         assert law.command.per_effort == pytest.approx(1.0 / (values["N"] * values["K_tau"] * values["eta"]))
         sizes[structure] = max(integrate_sensitivity(law, values, moves, k) for moves in (0, 1) for k in states)
     assert sizes["pid_dob"] < 1.001 * sizes["pid"]

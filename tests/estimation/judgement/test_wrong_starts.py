@@ -34,7 +34,7 @@ def record(seed, *, lead_s=0.0, noise=1e-3, friction=0.0, seconds=10.0):
     return so.Log.from_arrays(time=t[: t.size - before], I=current[before:], theta_m=read)
 
 
-def fit(log, friction=0.0, **settings):
+def fit(log, friction=0.0, band_hz=None, **settings):
     plant = so.plants.rotary(link="locked")
     plant = so.plants.let_stick(plant) if friction else plant
     start = {name: 1.2 * value for name, value in TRUTH.items()} | {"f_c": 1.2 * friction}
@@ -42,7 +42,7 @@ def fit(log, friction=0.0, **settings):
     names = (*TRUTH, "f_c") if friction else tuple(TRUTH)
     settings = {"initial_state": "rest", **settings}
     bench = so.Experiment(plant=plant, log=log, name="chirp", outputs=("theta_m",), **settings)
-    return so.fit([bench], known.free(*names))
+    return so.fit([bench], known.free(*names), band_hz=band_hz)
 
 
 def find_initial(result):
@@ -63,6 +63,13 @@ def test_a_log_that_begins_in_motion_is_not_met_as_one_that_rested(friction):
     assert right.met and not find_initial(right)
     for name, value in TRUTH.items():
         assert right.parameters[name].value == pytest.approx(value, rel=2e-3)
+
+
+@pytest.mark.parametrize("lead_s", [0.0, 2.0])
+def test_a_band_that_forgets_how_a_log_begins_leaves_nothing_to_be_said_of_that(lead_s):
+    """No state is free there, of which there would be a probability."""
+    result = fit(record(3, lead_s=lead_s), band_hz=(0.5, 100.0))
+    assert result.met and not find_initial(result)
 
 
 def test_a_wrong_position_is_noticed_as_a_wrong_speed_is():

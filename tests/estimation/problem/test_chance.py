@@ -20,6 +20,7 @@ def test_what_chance_exceeds(shape: float) -> None:
 def test_chance_at_the_ends() -> None:
     """All is above zero, nothing above infinity; and what is no number is not chance: no test passes on it."""
     assert [exceeds(3.0, x) for x in (0.0, -1.0, np.inf, 1e9)] == [1.0, 1.0, 0.0, 0.0]
+    assert [exceeds(0.0, x) for x in (0.0, 1e-9)] == [1.0, 0.0]  # of no degrees of freedom: the constant 0
     assert np.isnan(exceeds(3.0, np.nan)) and np.isnan(ljung_box(np.array([0.1, np.nan]), 100))
 
 
