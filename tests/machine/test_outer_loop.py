@@ -16,10 +16,9 @@ from seaopt.cli.main import app
 from seaopt.control import Impedance, add_impedance, tune_schedule
 from seaopt.machine.design_run import run_design
 from tests.machine.conftest import KNEE
+from tests.machine.conftest import OBSERVED as KNEE_SPEC
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_hidden import LINES as KNEE_LINES
-from tests.machine.test_hidden import SPEC as KNEE_SPEC
-from tests.machine.test_hidden import STATED
 
 T = 1e-3
 INERTIA, DAMPER = 0.5, 2.0  # of the link
@@ -313,7 +312,7 @@ def test_a_goal_that_stands_still_says_what_to_record(impedance):
 def test_a_log_of_the_force_law_alone_is_simulated_without_the_outer_loop(compiler, tmp_path):
     """With dry friction, which takes a simulation: the machine's own bench knows no outer loop."""
     locked, free = so.plants.rotary(link="locked"), so.plants.rotary()
-    values = free.complete(so.ParameterSet()).update(**STATED)
+    values = free.complete(so.ParameterSet()).update(**KNEE, f_c=0.005, v_s=1.0)
     force = so.tune(locked, values, replace(KNEE_SPEC, structure="pid"))
     law = add_impedance(force, free, values, Impedance(stiffness=20.0, damping=1.0), name="knee")
     reference = np.concatenate([multisine(1000, KNEE_LINES, 3, 1.0, seed) for seed in range(6)])

@@ -409,7 +409,8 @@ class PlausibilityGate:
             largest = spec.margin * largest_step(plant, limit / controller.per_effort)
         agreement = None
         if spec.agreement:
-            if controller.design is None or not hasattr(controller, "reads"):
+            plans = hasattr(controller, "prediction")  # predictive control, whose step compares no signals
+            if controller.design is None or plans:
                 raise ControlError("agreement: it is of a law that knows its design plant; leave it out")
             plant, values = controller.design
             rate = largest / controller.sample_time_s

@@ -229,8 +229,9 @@ class _Search:
         """Return a refit as undecided where bristles leave an excess on their way to a minimum: how far they got before
         they became too stiff is chance, and says nothing against them.
         """
-        lost = has_bristles(refit.problem) and refit.excess > REMOVED and self.is_on_its_way(refit)
-        return replace(refit, undecided=refit.undecided or lost)
+        if refit.undecided or not has_bristles(refit.problem) or refit.excess <= REMOVED:
+            return refit
+        return replace(refit, undecided=self.is_on_its_way(refit))
 
     def try_alone(self, pair: Refit) -> Iterator[Refit]:
         """Yield each part of a pair alone, from the pair's values: one of them may explain as much."""

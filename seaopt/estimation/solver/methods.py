@@ -12,6 +12,7 @@ import numpy as np
 from seaopt.errors import EstimationError, require_seed
 from seaopt.estimation.problem.experiment import check_shots
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
+from seaopt.estimation.problem.noise_floor import measure_excess
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.delay_cells import shift_start
@@ -23,12 +24,11 @@ from seaopt.estimation.solver.prediction import add_predictors, find_predicting_
 from seaopt.estimation.solver.settle import (
     Solved,
     explains_little,
-    measure_misfit,
     settle,
     settle_roughly,
 )
 from seaopt.estimation.solver.shots import cut_problem, find_start_on_shots, grow_shots
-from seaopt.estimation.solver.starts_around import search_around
+from seaopt.estimation.solver.starts_around import LOST, search_around
 from seaopt.records import record
 
 FAR = 10.0  # times its start: a parameter whose standard deviation is larger than itself there has lost its effect
@@ -290,23 +290,28 @@ def _list_waves(problem: FitProblem, *, sizes: bool = False) -> list[int]:
 def _approach_sticking(
     problem: FitProblem, start: Evaluation, method: Method, callback: Callback | None
 ) -> tuple[Evaluation, int]:
-    """Return a start that leaves noise, itself or followed over growing parts of the logs; or else the best of that, a
-    rough minimum from the start, and where that explains little, one from where the plant predicts; and the iterations
-    of rough minima. Where joints move at other times than in the log the cost has many minima, none of which explains
-    it: a search that went all the way would creep.
+    """Return a start that is far off followed over growing parts of the logs, where that leaves noise; or else, of one
+    that explains little, the better of a rough minimum from it and, where that explains little too, one from where the
+    plant predicts; and the iterations of rough minima. Where joints move at other times than in the log the cost has
+    many minima, none of which explains it: a search that went all the way would creep.
     """
-    roughly, finite = name_phase(callback, "looking for a start"), np.isfinite(start.cost)
-    followed = start if not finite or is_noise(problem, start.z) else follow_parts(problem, start, roughly)
-    if finite and (followed is start or is_noise(problem, followed.z)):
-        return followed, 0
+    roughly, finite = name_phase(callback, "looking for a start"), bool(np.isfinite(start.cost))
+    if finite and max(measure_excess(problem, start.z).values()) > LOST:
+        followed = follow_parts(problem, start, roughly)
+        if is_noise(problem, followed.z):
+            return followed, 0
+    if not explains_little(problem, start.power):
+        return start, 0
     minima = [settle_roughly(problem, start, roughly)] if finite else []
     if not minima or explains_little(minima[0].problem, minima[0].solution.evaluation.power):
         z = find_predicting_start(problem, start.z, method.max_iterations, roughly)
         predicting = None if z is None else problem.evaluate(z)
         if predicting is not None and np.isfinite(predicting.cost):
             minima.append(settle_roughly(problem, predicting, roughly))
-    found = [followed, *(problem.evaluate(each.solution.z) for each in minima)]
-    return min(found, key=measure_misfit), sum(each.solution.iterations for each in minima)
+    if not minima:
+        return start, 0
+    best = min(minima, key=lambda each: each.misfit)
+    return problem.evaluate(best.solution.z), sum(each.solution.iterations for each in minima)
 
 
 def _bring_back(solved: Solved, method: Method, callback: Callback | None) -> Solved:

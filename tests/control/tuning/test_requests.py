@@ -73,7 +73,7 @@ def test_a_defect_is_reported_with_the_request(monkeypatch: pytest.MonkeyPatch, 
     def fail(*_: object, **__: object) -> None:
         raise ValueError("zero-size array\nto reduction operation")
 
-    monkeypatch.setattr(found_law, "solve", fail)
+    monkeypatch.setattr(found_law, "solve_beside", fail)
     with pytest.raises(InternalError, match="zero-size array to reduction operation; please report") as caught:
         so.tune(stand, thor, so.ControllerSpec(bandwidth_hz=31.25))
     assert not isinstance(caught.value, SeaoptError) and isinstance(caught.value.__cause__, ValueError)
