@@ -420,8 +420,11 @@ def follow(
     if not np.any(limited) or not math.isfinite(law.force_limit_N):
         (b, d), given = take_weights(law), Inputs.make(law, ticks)
         return law.per_effort * given.respond(Law(a=law.a, b=b, c=law.c, d=d, sample_time_s=law.sample_time_s))[0]
-    columns, (reference, added) = np.reshape(law.b_measurement, (law.c.size, -1)), _compensate(law, ticks)
+    reference, added = _compensate(law, ticks)
     direct = law.d_reference * reference - ticks.measured @ np.ravel(law.d_measurement) + added
+    if not law.c.size:  # no state, for which the limit would make any difference
+        return law.per_effort * direct
+    columns = np.reshape(law.b_measurement, (law.c.size, -1))
     drive = np.outer(reference, law.b_reference) - ticks.measured @ columns.T
     over = share * law.force_limit_N * np.sign(ticks.command) - direct
     drive += np.outer(np.where(limited, over, 0.0), law.anti_windup)

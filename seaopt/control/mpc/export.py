@@ -18,6 +18,7 @@ from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE
 from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
+from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.control.mpc.active_set import DEPENDENT, DEPENDENT_SINGLE, TOLERANCE, TOLERANCE_SINGLE
 from seaopt.control.mpc.mpc import VIOLATION, ForceMPC
 from seaopt.control.mpc.output_bounds import SLACK_UNIT
@@ -231,10 +232,15 @@ def _format_terms(terms: Compensation | None, link: LinkPath | None, given: Mapp
     if terms is not None and terms.friction is not None:
         share = terms.friction.share_per_step(terms.sample_time_s)
         numbers |= {"FRICTION_EFFORT": terms.friction.effort, "FRICTION_SHARE": share}
-    if link is not None:
-        path = link.feedback(given["sample_time_s"])
-        numbers |= {"LINK_NUM": path.num.tolist(), "LINK_DEN": path.den.tolist(), "LINK_REST": find_rest_gain(path)}
-    return _format_part("What is added", numbers, *texts)
+    part = _format_part("What is added", numbers, *texts)
+    return part if link is None else part + _format_link(link.feedback(given["sample_time_s"]))
+
+
+def _format_link(path: TransferFunction) -> str:
+    """Return the numbers of what feeds the link back as C, in double, for its poles lie near 1."""
+    ends = {"LINK_NUM": path.num, "LINK_DEN": path.den}
+    lines = [f"static const double {name}[] = {{{', '.join(map(repr, ends[name].tolist()))}}};" for name in ends]
+    return "\n".join([*lines, f"static const double LINK_REST = {find_rest_gain(path)!r};", ""])
 
 
 def _place_terms(code: MPCCode) -> dict[str, int]:

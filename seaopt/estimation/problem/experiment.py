@@ -300,7 +300,7 @@ class Experiment:
         self._check_each_output()
         if isinstance(self.initial_state, Mapping):
             self._check_names("initial_state", self.initial_state, self.plant.states, f"a state of {self.plant.name}")
-        elif self.initial_state not in ("estimate", "rest"):
+        elif not isinstance(self.initial_state, str) or self.initial_state not in ("estimate", "rest"):
             raise self._refuse(
                 f'initial_state = {self.initial_state!r} is not known; give "estimate", "rest" or values by state'
             )

@@ -34,7 +34,9 @@ def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | No
     count = SHORTEST + max(e.weights.settle for e in problem.experiments)
     while count * np.sqrt(GROWTH) < longest:
         part = replace(near, experiments=tuple(e.take_first(count) for e in near.experiments))
-        if all(np.all(e.count_weighted()) for e in part.experiments) and not is_noise(part, z):
+        if not all(np.all(e.count_weighted()) for e in part.experiments):
+            return start  # an output is missing at first: what is followed would be long at once
+        if not is_noise(part, z):
             found = settle_roughly(part, part.evaluate(z), callback).solution
             z = found.z if np.isfinite(found.evaluation.cost) else z
         count *= GROWTH

@@ -97,8 +97,9 @@ def feed_link_forward(
 
 
 def _keeps(mpc: ForceMPC, pairs: Sequence[tuple[Plant, ParameterSet]], most: Sequence[float]) -> bool:
-    """Tell whether the linear region has no more than an Ms on each of some plants."""
-    return all(mpc.close(*pair).figures().ms <= allowed for pair, allowed in zip(pairs, most, strict=True))
+    """Tell whether the linear region is stable and has no more than an Ms on each of some plants."""
+    figures = [mpc.close(*pair).figures() for pair in pairs]
+    return all(each.stable and each.ms <= allowed for each, allowed in zip(figures, most, strict=True))
 
 
 def _split_law(mpc: ForceMPC) -> Law:

@@ -69,6 +69,16 @@ def test_in_c_and_python_the_sum_of_plan_and_link_is_within_limits(terms, compil
     assert np.max(np.abs(np.diff(commands, prepend=0.0))) < 0.8 + 1e-12
 
 
+def test_in_single_precision_a_link_at_rest_is_fed_nothing_and_motion_the_same(compiler, tmp_path):
+    """Poles and zeros of its filters lie near 1: with float coefficients 0.35 A were commanded at rest."""
+    mpc, t = plan(tmp_path, "link_feedforward = { fraction = 1.0 }\n"), 1e-3 * np.arange(3000)
+    rows = np.zeros((t.size, 4))
+    rows[:, 2] = 1.0 + np.where(t > 0.5, 0.3 * np.sin(6.0 * np.pi * (t - 0.5)), 0.0)
+    double, single = (run_c(compiler, tmp_path / str(each), mpc, rows, first=2, single=each) for each in (False, True))
+    assert np.ptp(double) > 1.0 and np.max(np.abs(single[:500])) < 1e-3
+    np.testing.assert_allclose(single, double, rtol=0.0, atol=0.02)
+
+
 def test_within_limits_the_plan_is_the_one_without_and_the_link_is_beside_it(compiler, tmp_path):
     mpc, rows = plan(tmp_path), draw_rows(5)
     rows = rows[np.all(np.abs(rows) < 9e9, axis=1)] * [0.1, 0.0, 0.02, 0.1]

@@ -75,9 +75,9 @@ void run(const double *in, size_t n, double *out) {
   static force_mpc s;
   force_mpc_reset(&s);
   for (size_t i = 0; i < n; i++, in += 4) {
-    const double asked = ASKED;
-    force_mpc_terms(&s, asked, in + FIRST);
-    out[i] = force_mpc_step(&s, asked, in[3]);
+    const force_mpc_real asked = (force_mpc_real)(ASKED), places[2] = {(force_mpc_real)in[1], (force_mpc_real)in[2]};
+    force_mpc_terms(&s, asked, places + FIRST - 1);
+    out[i] = force_mpc_step(&s, asked, (force_mpc_real)in[3]);
   }
 }
 """
@@ -102,9 +102,9 @@ def find_weight(term, positions):
     return chebval(np.clip(scaled, -1.0, 1.0), term.coefficients)
 
 
-def run_c(compiler, folder, mpc, rows, asked="in[0]", first=1):
+def run_c(compiler, folder, mpc, rows, asked="in[0]", first=1, *, single=False):
     """Return the commands of rows of what is asked, motor, link, torque."""
-    export_mpc(mpc, folder)
+    export_mpc(mpc, folder, single_precision=single)
     driver = DRIVER.replace("ASKED", asked).replace("FIRST", f"{first}")
     (folder / "example.c").write_text(driver, encoding="utf-8")
     files = [str(path) for path in folder.glob("*.c")]

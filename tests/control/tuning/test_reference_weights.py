@@ -96,13 +96,11 @@ def test_where_nothing_is_possible_the_least_miss_is_named(bench):
 
 @pytest.mark.parametrize("structure", ["pd", "pid", "pid_dob"])
 def test_the_static_gain_is_one(stand, thor, structure):
-    """By the law's coefficients and the plant's own static gain, 1 from effort to F1."""
+    """By the law's matrices and the plant's own static gain, 1 from effort to F1."""
     controller = so.tune(stand, thor, so.ControllerSpec(structure=structure, bandwidth_hz=25, max_noise_gain=60))
     gains = controller.gains
-    q = np.exp(-2j * np.pi * 1e-5 * controller.sample_time_s)
-    c_r, c_y = (
-        np.polyval(c.num[::-1], q) / np.polyval(c.den[::-1], q) for c in (controller.reference, controller.measurement)
-    )
+    law, z = controller.law, np.exp(2j * np.pi * 1e-5 * controller.sample_time_s)
+    c_r, c_y = (law.c @ np.linalg.solve(z * np.eye(law.c.shape[-1]) - law.a, law.b) + law.d).ravel()[:2] * [1.0, -1.0]
     assert abs(c_r / (1 + c_y)) == pytest.approx(1.0, abs=1e-4)
     if gains["k_i"] == 0.0:
         assert gains["k_r"] == pytest.approx(1.0 + gains["k_p"], rel=1e-12)

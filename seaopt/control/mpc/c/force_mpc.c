@@ -33,7 +33,7 @@ real force_mpc_outer(force_mpc *s, real reference, real position) {
 }
 #endif
 
-#if FORCE_MPC_PREFILTER || FORCE_MPC_LINK
+#if FORCE_MPC_PREFILTER
 /* A value behind a filter, in transposed form. */
 static real shape(real *state, int order, const real *num, const real *den, real value) {
   real out = num[0] * value + state[0];
@@ -50,6 +50,21 @@ static real clip(real x, real low, real high) { return x < low ? low : x > high 
 static real limited(real x, real most) { return clip(x, -most, most); }
 #endif
 #include "terms.h"
+
+#if FORCE_MPC_LINK
+/* The link's place behind its filters, at rest before, in transposed form. All of it is double: poles and zeros lie so
+   near 1 that in float they would be others. */
+static double feed_back(double *state, int *known, double place) {
+  if (!*known)
+    for (int i = LINK_ORDER; i-- > 0;)
+      state[i] = (LINK_NUM[i + 1] - LINK_REST * LINK_DEN[i + 1]) * place + (i + 1 < LINK_ORDER ? state[i + 1] : 0);
+  *known = 1;
+  double out = LINK_NUM[0] * place + state[0];
+  for (int i = 0; i < LINK_ORDER; i++)
+    state[i] = LINK_NUM[i + 1] * place - LINK_DEN[i + 1] * out + (i + 1 < LINK_ORDER ? state[i + 1] : 0);
+  return out;
+}
+#endif
 
 void force_mpc_terms(force_mpc *s, real reference, const real *readings) {
   int used = is_number(reference);
@@ -74,12 +89,7 @@ void force_mpc_terms(force_mpc *s, real reference, const real *readings) {
   s->differenced = 1;
 #endif
 #if FORCE_MPC_LINK
-  real place = readings[FORCE_MPC_LINK - 1];
-  if (!s->linked_known)
-    for (int i = LINK_ORDER; i-- > 0;)
-      s->linked[i] = (LINK_NUM[i + 1] - LINK_REST * LINK_DEN[i + 1]) * place + (i + 1 < LINK_ORDER ? s->linked[i + 1] : 0);
-  s->linked_known = 1;
-  effort -= shape(s->linked, LINK_ORDER, LINK_NUM, LINK_DEN, place);
+  effort -= (real)feed_back(s->linked, &s->linked_known, readings[FORCE_MPC_LINK - 1]);
 #endif
   s->added = mpc_per_effort * effort;
 }

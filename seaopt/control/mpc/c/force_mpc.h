@@ -32,7 +32,7 @@ typedef struct {
   force_mpc_real before;          /* what was differenced last */
   int differenced;                /* whether there was one */
 #if FORCE_MPC_LINK
-  force_mpc_real linked[FORCE_MPC_LINK_ORDER]; /* what the filters of the link's motion keep */
+  double linked[FORCE_MPC_LINK_ORDER]; /* what the filters of the link's motion keep */
   int linked_known;
 #endif
 #endif
