@@ -267,11 +267,13 @@ def _measure_output_error(
     experiment: FitExperiment, z: Vector, coarse: Sequence[Pass], fine: Sequence[Pass], *, rms: bool = False
 ) -> float:
     """Return the largest integration error in an output of an experiment, or its rms, in sigma: see
-    `measure_step_error`.
+    `measure_step_error`. Segments that are held out whole begin anywhere: no sample tells of their states.
     """
     scale = experiment.point(z).gain / _floored_sigma(experiment)
     worst = 0.0
-    for rough, halved in zip(coarse, fine, strict=True):
+    for segment, rough, halved in zip(experiment.segments, coarse, fine, strict=True):
+        if not segment.has_start:
+            continue
         assert rough.outputs is not None and halved.outputs is not None
         apart = scale * (rough.outputs - halved.outputs)
         change = np.sqrt(np.max(np.mean(apart**2, axis=0))) if rms else np.max(np.abs(apart))

@@ -10,7 +10,13 @@ import pytest
 
 import seaopt as so
 from seaopt.estimation.problem.fit_experiment import FitExperiment
-from seaopt.estimation.solver.step_size import STEP_ERROR_SIGMA, StepError, _choose_steps, check_steps
+from seaopt.estimation.solver.step_size import (
+    STEP_ERROR_SIGMA,
+    StepError,
+    _choose_steps,
+    check_steps,
+    measure_step_error,
+)
 
 
 def test_a_step_error_is_measured_again_where_derivatives_are_not_finite(swing, thor):
@@ -28,6 +34,25 @@ def test_a_step_error_is_measured_again_where_derivatives_are_not_finite(swing, 
         lost = replace(here, hessian=np.full_like(here.hessian, value))
         again = check_steps(problem, lost, known)["swing"]
         assert again is not known["swing"] and again.error == known["swing"].error
+
+
+def test_a_part_that_is_held_out_whole_has_no_step_error(swing, thor):
+    """No sample tells how it begins: a search of two logs with gaps left it at 1e139, and their fit was not met."""
+    log = so.virtual_log(swing, thor, so.bench.PAPER_SWING, duration_s=4, rate_hz=400, seed=1,
+                         sensors=so.Sensors(noise_std={"F1": 2.0}))  # fmt: skip
+    time = log.time + np.where(np.arange(log.time.size) < 1200, 0.0, 0.5)  # 3 s, and 1 s after a gap
+    log = so.Log.from_arrays(time=time, **{name: log[name] for name in ("I", "F1")})
+    experiment = so.Experiment(plant=swing, log=log, name="swing", outputs=("F1",))
+    fit = so.fit([experiment], thor.free("J"), holdout=0.3, diagnostics=False)
+    problem, z = fit.minimum.problem, fit.minimum.z.copy()
+    (posed,) = problem.experiments
+    first, last = posed.segments
+    assert first.has_start and not last.has_start
+    away = [slot.index for slot in last.initial if slot.index is not None]
+    assert away
+    z[away] = 1e130
+    error = measure_step_error(problem, posed, problem.evaluate(z))
+    assert error.output < 1.0 and error.parameter < 1.0
 
 
 @pytest.mark.parametrize("iterations", [2, 3])
