@@ -24,8 +24,10 @@ SHORTEST, GROWTH = 500, 2  # samples of the first part, and times as long is the
 NOISE = 1.5  # times a sensor's own, that a residual is at most where nothing is wrong
 
 
-def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | None = None) -> Evaluation:
-    """Return what is come to from a start over longer and longer parts of the logs, the whole at last."""
+def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | None = None) -> Evaluation | None:
+    """Return what is come to from a start over longer and longer parts of the logs, the whole at last; None where that
+    leaves more than the sensors' noise.
+    """
     unknowns, longest, z = problem.unknowns, max(e.longest for e in problem.experiments), start.z
     size = np.full(z.size, np.inf)
     size[: unknowns.shared] = np.abs(unknowns.start[: unknowns.shared])
@@ -35,16 +37,18 @@ def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | No
     while count * np.sqrt(GROWTH) < longest:
         part = replace(near, experiments=tuple(e.take_first(count) for e in near.experiments))
         if not all(np.all(e.count_weighted()) for e in part.experiments):
-            return start  # an output is missing at first: what is followed would be long at once
-        if not is_noise(part, z):
+            return None  # an output is missing at first: what is followed would be long at once
+        if not _is_noise(part, z):
             found = settle_roughly(part, part.evaluate(z), callback).solution
             z = found.z if np.isfinite(found.evaluation.cost) else z
         count *= GROWTH
-    if is_noise(problem, z):
-        return problem.evaluate(z)
-    return problem.evaluate(settle_roughly(problem, problem.evaluate(z), callback).solution.z)
+    if not _is_noise(problem, z):
+        z = settle_roughly(problem, problem.evaluate(z), callback).solution.z
+        if not _is_noise(problem, z):
+            return None
+    return problem.evaluate(z)
 
 
-def is_noise(problem: FitProblem, z: Vector) -> bool:
+def _is_noise(problem: FitProblem, z: Vector) -> bool:
     """Tell whether what is left of the logs is its sensors' noise."""
     return max(measure_excess(problem, z).values()) <= NOISE

@@ -17,16 +17,11 @@ from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.delay_cells import shift_start
 from seaopt.estimation.solver.first_guess import guess_from_responses
-from seaopt.estimation.solver.growing import follow_parts, is_noise
+from seaopt.estimation.solver.growing import follow_parts
 from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.loosening import loosen_start
 from seaopt.estimation.solver.prediction import add_predictors, find_predicting_start
-from seaopt.estimation.solver.settle import (
-    Solved,
-    explains_little,
-    settle,
-    settle_roughly,
-)
+from seaopt.estimation.solver.settle import Solved, explains_little, settle, settle_roughly
 from seaopt.estimation.solver.shots import cut_problem, find_start_on_shots, grow_shots
 from seaopt.estimation.solver.starts_around import LOST, search_around
 from seaopt.records import record
@@ -298,7 +293,7 @@ def _approach_sticking(
     roughly, finite = name_phase(callback, "looking for a start"), bool(np.isfinite(start.cost))
     if finite and max(measure_excess(problem, start.z).values()) > LOST:
         followed = follow_parts(problem, start, roughly)
-        if is_noise(problem, followed.z):
+        if followed is not None:
             return followed, 0
     if not explains_little(problem, start.power):
         return start, 0

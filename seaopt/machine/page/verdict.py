@@ -45,14 +45,13 @@ UNCERTIFIED = {
 
 def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     """Return the verdict on an acceptance."""
-    off = [(source, row) for source, row in zip(result.sources, result.replays, strict=True) if not row.met]
+    rows = list(zip(result.sources, result.replays, strict=True))
+    off = [(source, row) for source, row in rows if not row.met]
     reasons = [Reason(what=_say_mismatch(row, result), where=source) for source, row in off]
-    trips = zip(result.sources, result.replays, strict=True)
-    reasons += [Reason(what=say_trip(result.controller, row.trip), where=source) for source, row in trips if row.trip]
-    stays = zip(result.sources, result.replays, strict=True)
+    reasons += [Reason(what=say_trip(result.controller, row.trip), where=source) for source, row in rows if row.trip]
     reasons += [
         Reason(what=say_position_stays(result.controller, row.position_stays), where=source)
-        for source, row in stays
+        for source, row in rows
         if row.position_stays is not None
     ]
     count = format_count(len(result.sources), "log")
