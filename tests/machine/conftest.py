@@ -6,11 +6,13 @@ import pytest
 
 import seaopt as so
 from seaopt.control import Gains, Impedance, add_impedance
+from seaopt.machine.bringup.excitation import design_excitation
 from tests.machine.simulator import Bench, Machine
 
 KNEE = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "k_s": 300.0}
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
 
+FRICTION = 40.0  # N, of the dry machine
 OBSERVED = so.ControllerSpec(
     bandwidth_hz=20,
     structure="pid_dob",
@@ -66,3 +68,34 @@ def observed():
     gains = Gains.from_names(GAINS, observer)
     made = gains.law("pid_dob", 1e-3).balanced()
     return replace(law, law=made, gains=gains.by_name(), observer=observer), Machine.of_knee(values)
+
+
+def make_dry(compiler, folder, periods):
+    """Return the bench of a law for a plant with dry friction, and its reference of six sets of phases."""
+    values = so.plants.thor().update(f_c=FRICTION, v_s=5e-3)
+    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0)
+    law = so.tune(so.plants.high_impedance(), values, spec)
+    played = design_excitation(law, share=0.5, bias=0.0, phases=6, periods=periods, limits={"F1": 600.0}, seed=1)
+    return Bench(compiler, folder, law), played.reference
+
+
+@pytest.fixture(scope="package")
+def gentle():
+    """Return the stages of a knee, of which the first has so little effort that most of it is noise of 0.05 N m, and
+    its values.
+    """
+    knee = so.plants.rotary(link="locked")
+    values = knee.complete(so.ParameterSet()).update(
+        N=60, K_tau=0.06, eta=0.75, J_m=5e-5, b_r=1e-4, f_c=0.01, v_s=1.0, k_s=180.0
+    )
+    spec = so.ControllerSpec(
+        bandwidth_hz=20, measured="tau_s", current_limit_A=15.0, max_noise_gain=80, max_sensitivity=1.7
+    )
+    law = so.tune(knee, values, spec)
+
+    def tune_nothing(fraction):
+        raise so.SeaoptError("no law at this bandwidth")
+
+    options = {"samples": 5, "fractions": (0.2,), "limits": {"tau_s": 45.0}, "tune_stage": tune_nothing}
+    plan = so.bring_up(law, {"knee": knee}, values, sensors=so.Sensors(noise_std={"tau_s": 0.05}), **options)
+    return plan.stages, values

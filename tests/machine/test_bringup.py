@@ -262,25 +262,10 @@ def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_wh
     assert np.max(np.abs(run.current)) <= 1.001 * excitation.peaks["I"] < 0.8 * 9.0
 
 
-def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(plan, compiler, tmp_path):
+def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(gentle, compiler, tmp_path):
     """Played on the simulator in C, with its own noise: no tick is at the limit, which would cost its period, and the
     machine is told from one with twice the friction."""
-    knee = so.plants.rotary(link="locked")
-    values = knee.complete(so.ParameterSet()).update(
-        N=60, K_tau=0.06, eta=0.75, J_m=5e-5, b_r=1e-4, f_c=0.01, v_s=1.0, k_s=180.0
-    )
-    spec = so.ControllerSpec(
-        bandwidth_hz=20, measured="tau_s", current_limit_A=15.0, max_noise_gain=80, max_sensitivity=1.7
-    )
-    law = so.tune(knee, values, spec)
-
-    def tune_nothing(fraction):
-        raise so.SeaoptError("no law at this bandwidth")
-
-    stages = so.bring_up(
-        law, {"knee": knee}, values, samples=5, fractions=(0.2,), limits={"tau_s": 45.0}, tune_stage=tune_nothing,
-        sensors=so.Sensors(noise_std={"tau_s": 0.05}), certificate=plan.stages[-1].certificate,
-    ).stages  # fmt: skip
+    stages, values = gentle
     stage = stages[0]
     assert "beside which the noise of what it reads has no room" in stage.note and stage.certificate.met
     bench, reference = Bench(compiler, tmp_path, stage.controller), stage.excitation.reference
@@ -294,6 +279,7 @@ def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(plan, co
     assert "f_c" in (found.name, *found.alike) and found.explains > 0.95
     assert len(stages) == 2
     (tmp_path / "full").mkdir()
+    law = stages[1].controller
     full = Bench(compiler, tmp_path / "full", law).log(
         Machine.of_knee(values), stages[1].excitation.reference, noise=0.05
     )

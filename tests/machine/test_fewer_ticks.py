@@ -8,21 +8,15 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.machine.bringup.excitation import design_excitation
-from tests.machine.simulator import Bench, Machine
+from tests.machine.conftest import FRICTION, make_dry
+from tests.machine.simulator import Machine
 
-FRICTION = 40.0
 RIGHT = replace(Machine(), coulomb=FRICTION, smoothing=5e-3)
 
 
 @pytest.fixture(scope="module")
 def dry(compiler, tmp_path_factory):
-    """Return the bench of a law for a plant with dry friction, and its reference of six sets of phases."""
-    values = so.plants.thor().update(f_c=FRICTION, v_s=5e-3)
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0)
-    law = so.tune(so.plants.high_impedance(), values, spec)
-    played = design_excitation(law, share=0.5, bias=0.0, phases=6, periods=8, limits={"F1": 600.0}, seed=1)
-    return Bench(compiler, tmp_path_factory.mktemp("dry"), law), played.reference
+    return make_dry(compiler, tmp_path_factory.mktemp("dry"), periods=8)
 
 
 def keep_every(log, every, first=0):

@@ -17,6 +17,7 @@ from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import LeftOut, cut_periods, find_period, join_blocks
 from seaopt.machine.response.verdicts import Measured, judge_response
 from seaopt.machine.ticks import take_ticks
+from tests.machine.conftest import FRICTION, make_dry
 from tests.machine.simulator import Bench, Machine, multisine
 
 LINES = np.unique(np.round(np.geomspace(1, 150, 40)).astype(int))
@@ -333,17 +334,9 @@ def test_what_is_divided_by_nothing_sure_has_the_set_of_fieller():
     assert np.mean(unsure) > 0.5 and held > 0.86 and known < 1.0
 
 
-FRICTION = 40.0
-
-
 @pytest.fixture(scope="module")
 def dry(compiler, tmp_path_factory):
-    """Return the bench of a law for a plant with dry friction, and its reference of six sets of phases."""
-    values = so.plants.thor().update(f_c=FRICTION, v_s=5e-3)
-    spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0)
-    law = so.tune(so.plants.high_impedance(), values, spec)
-    played = design_excitation(law, share=0.5, bias=0.0, phases=6, periods=4, limits={"F1": 600.0}, seed=1)
-    return Bench(compiler, tmp_path_factory.mktemp("dry"), law), played.reference
+    return make_dry(compiler, tmp_path_factory.mktemp("dry"), periods=4)
 
 
 def test_with_dry_friction_what_is_predicted_is_of_the_reference_that_was_played(dry):

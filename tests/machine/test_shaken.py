@@ -16,23 +16,9 @@ NOISE = 0.05
 
 
 @pytest.fixture(scope="module")
-def stage(compiler, tmp_path_factory):
-    """Return a knee's stage of little effort, most of which is noise, its values and its bench."""
-    knee = so.plants.rotary(link="locked")
-    values = knee.complete(so.ParameterSet()).update(
-        N=60, K_tau=0.06, eta=0.75, J_m=5e-5, b_r=1e-4, f_c=0.01, v_s=1.0, k_s=180.0
-    )
-    spec = so.ControllerSpec(
-        bandwidth_hz=20, measured="tau_s", current_limit_A=15.0, max_noise_gain=80, max_sensitivity=1.7
-    )
-    law = so.tune(knee, values, spec)
-
-    def tune_nothing(fraction):
-        raise so.SeaoptError("no law at this bandwidth")
-
-    options = {"samples": 5, "fractions": (0.2,), "limits": {"tau_s": 45.0}, "tune_stage": tune_nothing}
-    plan = so.bring_up(law, {"knee": knee}, values, sensors=so.Sensors(noise_std={"tau_s": NOISE}), **options)
-    first = plan.stages[0]
+def stage(compiler, tmp_path_factory, gentle):
+    """Return the first stage, its values and its bench."""
+    (first, _), values = gentle
     return first, values, Bench(compiler, tmp_path_factory.mktemp("shaken"), first.controller)
 
 
