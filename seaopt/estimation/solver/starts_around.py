@@ -15,13 +15,13 @@ the given delay first: of logs of 8 s of a knee with two encoders 5 of 12 were f
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
 from seaopt.estimation.problem.fit_problem import FitProblem
-from seaopt.estimation.problem.noise_floor import measure_excess
 from seaopt.estimation.problem.normal_equations import invert
-from seaopt.estimation.solver.growing import NOISE
+from seaopt.estimation.solver.growing import NOISE, list_ways, measure_most
 from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.settle import Solved, settle, settle_roughly
 
@@ -39,25 +39,20 @@ def search_around(solved: Solved, seed: int, max_iterations: int, callback: Call
     sticks, strayed = any(e.model.sticks for e in problem.experiments), _has_strayed(solved)
     if problem.all_linear or not (sticks or strayed):
         return solved
-    most = _measure_most(solved)
+    most = measure_most(problem, z)
     lost = sticks and most > LOST
     if most <= NOISE or not (lost or strayed):
         return solved
     callback, rng, best = name_phase(callback, "another start"), np.random.default_rng(seed), solved
     held = _hold_delays(problem) if lost else problem
-    ways, tried = np.ones(count), set[tuple[float, ...]]()
-    while len(tried) < min(STARTS, 2**count):
-        ways = -ways if len(tried) % 2 else rng.choice([-1.0, 1.0], count)
-        if tuple(ways) in tried:
-            continue
-        tried.add(tuple(ways))
+    for ways in islice(list_ways(count, rng), STARTS):
         start = unknowns.start.copy() if lost else z.copy()
         start[:count] = unknowns.start[:count] * OFF**ways
         rough = settle_roughly(held, held.evaluate(np.clip(start, unknowns.low, unknowns.high)), callback)
         if lost:
             rough = settle_roughly(problem, problem.evaluate(rough.solution.z), callback)
         best = min(best, rough, key=lambda each: each.misfit)
-        if best is rough and _measure_most(rough) <= NOISE:
+        if best is rough and measure_most(rough.problem, rough.solution.z) <= NOISE:
             break
     if best is solved:
         return solved
@@ -84,8 +79,3 @@ def _has_strayed(solved: Solved) -> bool:
     variances = np.diag(invert(evaluation.hessian)[0])[: unknowns.shared]
     far = (z > FAR * start) | ((z < start / FAR) & (variances < z**2))
     return bool(np.any(far & (start > 0.0)))
-
-
-def _measure_most(solved: Solved) -> float:
-    """Return how many times its sensor's noise a residual is at most."""
-    return max(measure_excess(solved.problem, solved.solution.z).values())

@@ -67,18 +67,36 @@ def test_a_search_that_ended_near_by_begins_again_around_the_given_values(seed):
 
 @pytest.mark.parametrize(
     ("seed", "seconds", "f_c", "amplitude", "quiet_s", "most"),
-    [(1, 15.0, 0.08, 0.9, 0.0, 90), (12, 15.0, 0.06, 1.2, 0.0, 90), (2, 8.0, 0.05, 1.0, 1.5, 250)],
-    ids=["stuck for four fifths", "stuck for two fifths", "quiet at first"],
+    [
+        (1, 15.0, 0.08, 0.9, 0.0, 90),
+        (12, 15.0, 0.06, 1.2, 0.0, 90),
+        (2, 8.0, 0.05, 1.0, 1.5, 150),
+        (5, 8.0, 0.05, 0.8, 2.2, 150),
+        (6, 10.0, 0.08, 1.2, 5.0, 150),
+        (7, 10.0, 0.05, 1.0, 6.0, 150),
+    ],
+    ids=[
+        "stuck for four fifths",
+        "stuck for two fifths",
+        "quiet at first",
+        "quiet for a quarter",
+        "quiet for half",
+        "quiet for most",
+    ],
 )
 def test_a_joint_that_sticks_is_followed_from_the_first_part_on(seed, seconds, f_c, amplitude, quiet_s, most):
-    """Over the whole log from the start they took 272, 275 and 716 evaluations."""
+    """Over the whole log from the start the first three took 272, 275 and 716 evaluations. Values that differ in the
+    tenth digit are found as well: a first part in which nothing moves left the third to chance.
+    """
     bench, known = pose(record(seed, seconds, f_c=f_c, amplitude=amplitude, quiet_s=quiet_s), f_c)
-    before = count_evaluations()
-    fit = so.fit([bench], known, diagnostics=False)
-    assert count_evaluations() - before < most
-    assert fit.nuisance["bench"].delay_s == pytest.approx(DELAY_S, abs=2e-5)
-    for name, value in (TRUTH | {"f_c": f_c}).items():
-        assert fit.parameters[name].value == pytest.approx(value, rel=2e-3)
+    for off in (0.0, 1e-10, -1e-9):
+        near = known.update(k_s=known["k_s"].value * (1.0 + off)).free("k_s")
+        before = count_evaluations()
+        fit = so.fit([bench], near, diagnostics=False)
+        assert count_evaluations() - before < most
+        assert fit.nuisance["bench"].delay_s == pytest.approx(DELAY_S, abs=2e-5)
+        for name, value in (TRUTH | {"f_c": f_c}).items():
+            assert fit.parameters[name].value == pytest.approx(value, rel=2e-3)
 
 
 def test_a_first_part_is_the_fit_of_a_log_that_ends_there():
