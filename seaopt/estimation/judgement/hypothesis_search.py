@@ -473,8 +473,8 @@ def _rest(problem: FitProblem, start: Evaluation, old: FitProblem) -> FitProblem
     """Return a problem whose joints start as the fit has them, at rest: no slope tells with which speed, or with which
     state of what is added. A segment that the fit did not have starts anywhere. `old`: the problem of the fit.
     """
-    places, unknowns = problem.find_stopped(), problem.unknowns
-    if not places or np.any(start.z[places] != 0.0):
+    places, unknowns = problem.find_resting(start.z), problem.unknowns
+    if not places:
         return problem
     before = dict(zip(old.unknowns.names, old.unknowns.low == old.unknowns.high, strict=True))
     groups = {name.rpartition(".")[0] for name in before}

@@ -50,6 +50,7 @@ from seaopt.records import record
 from seaopt.simulation import Pass, measure_room, threads
 
 LOST = 1e-3  # below zero: a sum of squares that is nothing but rounding of a far larger one
+STILL = 1e-9  # of what its input could give a joint: no speed
 ALONE = 8_000  # samples below which experiments are not worth a thread each
 
 T = TypeVar("T")
@@ -195,6 +196,11 @@ class FitProblem:
         unknowns = self.unknowns
         pairs = enumerate(zip(unknowns.names, unknowns.prior_std, strict=True))
         return [i for i, (name, std) in pairs if i >= unknowns.shared and ".initial" in name and np.isfinite(std)]
+
+    def find_resting(self, z: Vector) -> list[int]:
+        """Return those unknowns where all of them are at rest, to rounding; none where one is not."""
+        places = self.find_stopped()
+        return places if np.all(np.abs(z[places]) <= STILL * self.unknowns.prior_std[places]) else []
 
     @np.errstate(all="ignore")  # a plant that overflows gives a cost that is not finite, which callers check
     def assemble(self, passes: PassSet, to: Vector | None = None) -> Evaluation:

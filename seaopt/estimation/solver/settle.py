@@ -70,8 +70,8 @@ def settle(problem: FitProblem, start: Evaluation, max_iterations: int, callback
     def solve(stage: FitProblem, evaluation: Evaluation) -> Solved:
         return _settle(stage, evaluation, max_iterations, callback)
 
-    places, unknowns = problem.find_stopped(), problem.unknowns
-    if not places or np.any(start.z[places] != 0.0):
+    places, unknowns = problem.find_resting(start.z), problem.unknowns
+    if not places:
         return sharpen(problem, start, solve)
     resting = sharpen(replace(problem, unknowns=unknowns.bound(places, 0.0, 0.0)), start, solve)
     freed = replace(resting.problem, unknowns=unknowns)
