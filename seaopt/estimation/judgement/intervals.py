@@ -24,6 +24,7 @@ from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError
+from seaopt.estimation.solver.least_squares import minimise
 from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.estimation.solver.step_size import STEP_ERROR_PARAMETER, STEP_ERROR_SIGMA
 from seaopt.logs.quality.faults import find_quantisation
@@ -42,6 +43,7 @@ FOLLOWED = 30.0  # standard deviations by which the outputs follow what is small
 MORE = 1.5  # times the variance by white noise of its size, that rounding makes of a value: worth a word
 CHANCE = 4.5e-5  # with which a log's residual falls by chance as far as is taken for a wrong state at its start
 HALF = 0.5  # of a residual's power: what leaves less is another explanation, wherever the values are
+NEAR, ITERATIONS = 1e-2, 8  # squared standard deviations that may be left to a minimum, and steps to come so near
 FAINT = 1e-6  # of an output's spread: a residual that is less is no motion
 ROUNDING = 1e-12  # of what an unknown does: less of it left is rounding
 READING = 0.05  # of a constant, up to which what is white about it is a reading's noise
@@ -144,9 +146,9 @@ def find_rounding(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
 
 
 def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
-    """Yield logs that do not begin in the state that is stated: with it free, in one step from the minimum, their
-    residuals fall by more than chance makes of residuals of this colour. Where that moves values beyond their
-    intervals, these are not to be believed.
+    """Yield logs that do not begin in the state that is stated: with it free, their residuals fall by more than chance
+    makes of residuals of this colour. Where that moves values beyond their intervals, these are not to be believed. One
+    step from the minimum tells, but where joints stick: it throws one that is to be found in motion.
     """
     minimum = fit.require_minimum("find_wrong_starts")
     problem = minimum.problem
@@ -161,7 +163,9 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
         return
     step = solve_seen(first.hessian, -first.gradient, ROUNDING)
     second = freed.evaluate(np.clip(first.z + step, freed.unknowns.low, freed.unknowns.high))
-    best = min(first, second, key=lambda evaluation: evaluation.cost)
+    nearer = min(first, second, key=lambda evaluation: evaluation.cost)
+    low, high = freed.unknowns.low, freed.unknowns.high
+    best = minimise(freed, nearer, low, high, decrement=NEAR, max_iterations=ITERATIONS).evaluation
     fitted, values = problem.evaluate(minimum.z).power, freed.unknowns.by_name(best.z)
     moved = {name: abs(values[name] - fit.parameters[name].value) for name in fit.covariance.names}
     beyond = {n: away for n, away in moved.items() if away > QUANTILE * (fit.parameters[n].total_std or 0.0)}
@@ -203,7 +207,7 @@ def free_starts(minimum: Minimum, stated: Collection[str]) -> tuple[FitProblem, 
     for old, new in zip(problem.experiments, freed.experiments, strict=True):
         for before, after in zip(old.segments, new.segments, strict=True):
             for known, slot in zip(before.initial, after.initial, strict=True):
-                if slot.index is not None:
+                if old.name in stated and slot.index is not None:
                     at[slot.index] = known.at(minimum.z)
                     states[old.name] += 1
     return copy_steps(freed, problem), at, states

@@ -35,14 +35,21 @@ def record(seed, *, lead_s=0.0, noise=1e-3, friction=0.0, seconds=10.0):
 
 
 def fit(log, friction=0.0, band_hz=None, **settings):
+    return fit_logs({"chirp": (log, {"initial_state": "rest", **settings})}, friction, band_hz)
+
+
+def fit_logs(logs, friction=0.0, band_hz=None):
+    """Return the fit of logs, each with the settings of its experiment."""
     plant = so.plants.rotary(link="locked")
     plant = so.plants.let_stick(plant) if friction else plant
     start = {name: 1.2 * value for name, value in TRUTH.items()} | {"f_c": 1.2 * friction}
     known = plant.defaults.update(K_tau=K_TAU, N=N, c_s=0.0, **start)
     names = (*TRUTH, "f_c") if friction else tuple(TRUTH)
-    settings = {"initial_state": "rest", **settings}
-    bench = so.Experiment(plant=plant, log=log, name="chirp", outputs=("theta_m",), **settings)
-    return so.fit([bench], known.free(*names), band_hz=band_hz)
+    experiments = [
+        so.Experiment(plant=plant, log=log, name=name, outputs=("theta_m",), **settings)
+        for name, (log, settings) in logs.items()
+    ]
+    return so.fit(experiments, known.free(*names), band_hz=band_hz)
 
 
 def find_initial(result):
@@ -63,6 +70,21 @@ def test_a_log_that_begins_in_motion_is_not_met_as_one_that_rested(friction):
     assert right.met and not find_initial(right)
     for name, value in TRUTH.items():
         assert right.parameters[name].value == pytest.approx(value, rel=2e-3)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.02])
+@pytest.mark.parametrize("other", ["rest", "estimate"])
+@pytest.mark.parametrize("seed", [1, 3])
+def test_one_of_two_logs_that_begins_in_motion_is_named(seed, other, friction):
+    """A step that frees how both begin throws the joint where it sticks: 40 times the noise had no cause. Beside a log
+    whose state is free it ended in an error of Python's.
+    """
+    begins = {"still": (record(seed, friction=friction), {"initial_state": other})}
+    moves = {"moving": (record(seed + 1, lead_s=2.0, friction=friction), {"initial_state": "rest"})}
+    wrong = fit_logs(begins | moves, friction)
+    assert not wrong.met
+    assert [(each.where, each.severity) for each in find_initial(wrong)] == [("moving", "error")]
+    assert not any(each.kind == "cause" for each in wrong.findings)
 
 
 @pytest.mark.parametrize("lead_s", [0.0, 2.0])
