@@ -9,6 +9,8 @@ SEAOPT = Path(__file__).resolve().parents[1] / "seaopt"
 # Names of what is said. A search of them, or a cut, is a sentence that is parsed.
 SAID = {"text", "where", "reason", "message", "sentence", "explanation", "verdict", "said", "remedy", "summary",
         "label", "draws", "proof", "assumption", "statement", "what", "str"}  # fmt: skip
+LISTS = {"active_constraints", "blocked_by", "broken", "explanations", "labels", "notes", "reasons", "remarks",
+         "sentences", "texts"}  # of what is said: their entries are, under any name  # fmt: skip
 CUTS = {"split", "rsplit", "partition", "rpartition", "startswith", "endswith", "find", "index", "removeprefix",
         "removesuffix"}  # fmt: skip
 PATTERNS = {"search", "match", "fullmatch", "findall", "finditer", "split"}  # verbs of a regular expression that read
@@ -17,8 +19,6 @@ READERS = {
     "cli/frontier.py": "an argument of the command line",
     "cli/inspect.py": "an argument of the command line",
     "cli/terminal.py": "blanks of an error's text, and whether it names something to type",
-    "control/laws/verdict.py": "active_constraints of controller.json are labels, NAME (PLANT)",
-    "control/tuning/tuner.py": "labels of limits that are broken, as active_constraints",
     "errors.py": "blanks of an error's text",
     "files.py": "Python's own text of an error, without its advice to programmers",
     "estimation/result/identifiability.py": "EXPERIMENT.NAME of an unknown",
@@ -52,20 +52,26 @@ def name_of(node):
 
 def list_parsed(source):
     """Yield what cuts or searches something that is said."""
-    for node in ast.walk(ast.parse(source)):
+    tree = ast.parse(source)
+    loops = [node for node in ast.walk(tree) if isinstance(node, ast.For | ast.comprehension)]
+    said = SAID | {
+        loop.target.id for loop in loops if isinstance(loop.target, ast.Name) and name_of(loop.iter) in LISTS
+    }
+    for node in ast.walk(tree):
         match node:
-            case ast.Call(func=ast.Attribute(attr=verb, value=value)) if verb in CUTS and name_of(value) in SAID:
+            case ast.Call(func=ast.Attribute(attr=verb, value=value)) if verb in CUTS and name_of(value) in said:
                 yield ast.unparse(node)
-            case ast.Call(func=ast.Attribute(attr=verb), args=[*_, said]) if verb in PATTERNS and name_of(said) in SAID:
+            case ast.Call(func=ast.Attribute(attr=verb), args=[*_, text]) if verb in PATTERNS and name_of(text) in said:
                 yield ast.unparse(node)
-            case ast.Compare(ops=[ast.In() | ast.NotIn()], comparators=[value]) if name_of(value) in SAID:
+            case ast.Compare(ops=[ast.In() | ast.NotIn()], comparators=[value]) if name_of(value) in said:
                 yield ast.unparse(node)
 
 
 def test_the_search_finds_what_was_parsed_before():
     source = "plant = row.where.split(':')[0]\nhead = str(draws).partition(':')\nunstable = 'UNSTABLE' in row.text\n"
     source += "first = re.split(', ', question.text)[0]\nsize = _NUMBER.search(finding.text)\n"
-    assert len(list(list_parsed(source))) == 5
+    source += "easing = [name.partition(' (')[0] for name in controller.active_constraints]\n"
+    assert len(list(list_parsed(source))) == 6
 
 
 def test_no_sentence_of_a_result_is_parsed():

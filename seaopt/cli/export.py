@@ -13,12 +13,13 @@ from seaopt.cli.provenance import FILES, digest
 from seaopt.cli.session import OWN_LAW, SCHEMAS
 from seaopt.cli.terminal import Amount, Terminal
 from seaopt.codec import from_content, to_content
+from seaopt.control import Controller
 from seaopt.control.deploy.c_text import strip_markup
 from seaopt.control.deploy.export import export, read_guard
 from seaopt.control.deploy.target import Tare
 from seaopt.control.laws.plausibility import Agreement, GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
-from seaopt.control.laws.verdict import join_labels
+from seaopt.control.laws.verdict import join_limits
 from seaopt.control.mpc.export import SOURCES, set_gate, set_heat, write_code
 from seaopt.control.mpc.stored import read_code
 from seaopt.errors import ControlError, ProblemError
@@ -91,7 +92,7 @@ def export_controller(
         return met
     console = Terminal()
     schedule = content["schedule"]
-    missed = [join_labels(content["active_constraints"])] if schedule is None else schedule["broken"]
+    missed = [_join_missed(content)] if schedule is None else schedule["broken"]
     for good, text in (
         (fit_met, UNMET),
         (feasible, "; ".join(missed)),
@@ -217,11 +218,17 @@ def _find_raised_limit(content: Mapping[str, Any], options: Mapping[str, Any]) -
     return find_raised_limit(stored.command, stored.spec, limits[0])
 
 
+def _join_missed(content: Mapping[str, Any]) -> str:
+    """Return the limits that the law of a controller.json misses."""
+    return join_limits(Controller.read(content).binding)
+
+
 def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tuple[Path, ...]:
     """Write the C code of predictive control; limits and names are those that it was designed with."""
     if not options.pop("allow_infeasible", False) and not content["feasible"]:
-        missed = join_labels(content["active_constraints"])
-        raise ProblemError(f"the controller misses {missed}; tune one that does not, or type --allow-infeasible")
+        raise ProblemError(
+            f"the controller misses {_join_missed(content)}; tune one that does not, or type --allow-infeasible"
+        )
     gate, derate, uncertified = options.pop("gate"), options.pop("derate"), options.pop("uncertified")
     typed = {name for name, value in options.items() if value not in (None, False) and name != "precision"}
     if typed - {"name"} or options["name"] != "force_law":

@@ -8,7 +8,7 @@ import pytest
 
 import seaopt as so
 from seaopt.control import CompensateGravity, add_compensation
-from seaopt.control.laws.verdict import advise_easing
+from seaopt.control.laws.verdict import BindingLimit, advise_easing
 from seaopt.reporting.sections.data import Commands
 from seaopt.reporting.sections.kinds import controller as controllers
 from seaopt.reporting.sections.kinds.certificate import REMEDIES, advise, judge
@@ -77,9 +77,11 @@ def test_only_a_limit_that_binds_is_eased(stand, thor):
     error = Requirement(name="steady_error", limit=0.03, value=0.04, met=False, plant="stand")
     text = advise(error, controller, models={})
     assert "lower bandwidth_hz" in text and "noise" not in text
-    bound = replace(controller, active_constraints=("max_noise_gain", "max_complementary (stand)", "max_noise_gain"))
+    noise, stand_peak = BindingLimit(name="max_noise_gain"), BindingLimit(name="max_complementary", plant="stand")
+    bound = replace(controller, binding=(noise, stand_peak, noise))
     assert advise(error, bound, models={}).endswith("or raise max_noise_gain and max_complementary")
-    assert advise_easing(("min_sensitivity_bandwidth_hz", "shoulder_hz")) == "lower min_sensitivity_bandwidth_hz"
+    unliftable = [BindingLimit(name=name) for name in ("min_sensitivity_bandwidth_hz", "shoulder_hz")]
+    assert advise_easing(unliftable) == "lower min_sensitivity_bandwidth_hz"
 
 
 def test_a_link_that_nothing_holds_is_what_an_integral_fails_on(stand, thor):

@@ -47,7 +47,7 @@ from seaopt.control.laws.plausibility import LARGEST, PlausibilityGate
 from seaopt.control.laws.realisation import RunnableLaw, check_guards, find_raised_limit, runnable
 from seaopt.control.laws.spec import check_command_limits
 from seaopt.control.laws.structures import AGREES
-from seaopt.control.laws.verdict import join_labels
+from seaopt.control.laws.verdict import join_limits
 from seaopt.control.loops.compensation.link_feedforward import multiply_out
 from seaopt.control.loops.compensation.ripple_term import COSINE, MOST_TURNS, SINE, RippleTerm
 from seaopt.control.loops.compensation.terms import Compensation, FrictionTerm, GravityTerm
@@ -165,7 +165,7 @@ def export(
         templates, kind = SCHEDULE_TEMPLATES, "schedule"
     else:
         stored, figures, heat = _read(content)
-        templates, missed, met, kind = TEMPLATES, join_labels(stored.active_constraints), stored.met, "controller"
+        templates, missed, met, kind = TEMPLATES, join_limits(stored.binding), stored.met, "controller"
         law = runnable(stored, command_limit=limit, tracking_time_s=tracking_time_s, gate=False, heat=False)
     heat = derate if isinstance(derate, HeatGuard) else heat
     derate = stored.derate if derate is None else derate

@@ -22,7 +22,7 @@ from seaopt.control.laws.stored import (
     read_controller,
 )
 from seaopt.control.laws.structures import LAW_GAINS, DisturbanceObserver, Gains, Prefilter, SpeedLoop
-from seaopt.control.laws.verdict import PossibleBandwidths, list_broken_figures, shorten_blocked
+from seaopt.control.laws.verdict import BindingLimit, PossibleBandwidths, list_broken_figures, shorten_blocked
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath, multiply_out
 from seaopt.control.loops.compensation.terms import Compensation
@@ -119,7 +119,7 @@ class Controller(ClosesLoops, Result, Worded):
         Of the design plant.
     met : bool
         Whether every limit is met, as measured.
-    active_constraints : tuple of str
+    binding : tuple of BindingLimit
         The limits that are broken; if none is, those that are just met.
     robust_to : tuple of str
         The plants, besides the design plant, that Ms and Mt were kept on.
@@ -171,7 +171,7 @@ class Controller(ClosesLoops, Result, Worded):
     spec: ControllerSpec
     achieved: LoopFigures
     met: bool
-    active_constraints: tuple[str, ...]
+    binding: tuple[BindingLimit, ...]
     robust_to: tuple[str, ...] = ()
     design: tuple[Plant, ParameterSet] | None = None
     observer: DisturbanceObserver | None = None
@@ -312,6 +312,11 @@ class Controller(ClosesLoops, Result, Worded):
     def measurement(self) -> TransferFunction:
         """C_y of F_m = C_r F_ref - C_y F_meas: the law multiplied out, for reading; of the regulated output."""
         return self.law.transfer_functions()[1]
+
+    @property
+    def active_constraints(self) -> tuple[str, ...]:
+        """The limits that bind, as controller.json has them: NAME, or NAME (PLANT) where it holds for several."""
+        return tuple(map(str, self.binding))
 
     @property
     def explanation(self) -> str:
@@ -555,7 +560,8 @@ class Controller(ClosesLoops, Result, Worded):
             first, *stuck = (controller.measure(f"design plant{state}", each) for state, each in states.items())
             loops = [controller._add_friction(first), *stuck]
         broken = tuple(list_broken_figures(spec, loops) if controller.met else ())
-        return replace(controller, met=False, active_constraints=broken, blocked_by=broken) if broken else controller
+        controller = replace(controller, met=False, binding=broken) if broken else controller
+        return replace(controller, blocked_by=controller.active_constraints) if broken else controller
 
     def measure_states(self) -> dict[str, LoopFigures]:
         """Return the design plant's figures by its state, " sliding" and " stuck" where it has friction, else ""."""

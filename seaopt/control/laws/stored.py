@@ -24,7 +24,7 @@ from seaopt.control.laws.structures import (
     Gains,
     Nominal,
 )
-from seaopt.control.laws.verdict import PossibleBandwidths
+from seaopt.control.laws.verdict import BindingLimit, PossibleBandwidths
 from seaopt.control.loops.absolute_stability import MARGIN_PRECISION, FrictionMargin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.compensation.terms import Compensation
@@ -133,13 +133,15 @@ class StoredLoop:
 class StoredController(StoredLoop):
     """The controller.json of one law."""
 
+    json_names = {"binding": "active_constraints"}
+
     gains: dict[str, float]
     blocks: StoredBlocks
     terms: Terms
     law: StoredLaw
     reference: TransferFunction
     measurement: TransferFunction | tuple[TransferFunction, ...]
-    active_constraints: tuple[str, ...]
+    binding: tuple[BindingLimit, ...]
     blocked_by: tuple[str, ...] = ()
     possible: PossibleBandwidths | None = None
     measured_responses: tuple[MeasuredFigures, ...] = ()
@@ -191,7 +193,7 @@ def read_controller(content: Mapping[str, Any]) -> dict[str, Any]:
             raise _contradict("command.largest", f"is {largest:g}, and a duty ends at 1")
         command = replace(command, largest=largest)
     taken = ("structure", "gains", "sample_time_s", "compute_delay_samples", "drive_delay_s")
-    taken += ("active_constraints", "blocked_by", "possible")
+    taken += ("binding", "blocked_by", "possible")
     terms = table.terms
     return {name: getattr(table, name) for name in taken} | {
         "law": law,

@@ -22,6 +22,24 @@ EASED: dict[str, Sense] = {"raise": "at most", "lower": "at least"}
 NEARLY_USED = 0.01  # a limit met with no more than this share to spare, and the reserve, is called active
 
 
+@record
+class BindingLimit:
+    """A limit that binds or is broken; `plant`: on which, "" where it is the design plant's alone. A file has both in
+    one text, as it prints.
+    """
+
+    name: str
+    plant: str = ""
+
+    def __str__(self) -> str:
+        return self.name + _format_plants([self.plant] if self.plant else [])
+
+    @classmethod
+    def _from_json(cls, content: str) -> BindingLimit:
+        name, _, plant = content.removesuffix(")").partition(" (")
+        return cls(name=name, plant=plant)
+
+
 @record(eq=False)
 class LimitVerdict:
     """One limit against one loop's figure; `plant` is the loop's name, `stuck` the design plant stuck by friction."""
@@ -39,9 +57,9 @@ class LimitVerdict:
         return self.limit.scope == "every plant" or self.stuck
 
     @property
-    def label(self) -> str:
-        """The limit's name, with the plant where it holds for several."""
-        return f"{self.limit.name} ({self.plant})" if self.names_plant else self.limit.name
+    def binding(self) -> BindingLimit:
+        """The limit, with the plant where it holds for several."""
+        return BindingLimit(name=self.limit.name, plant=self.plant if self.names_plant else "")
 
     @property
     def severity(self) -> float:
@@ -119,9 +137,9 @@ def judge_all(spec: LoopSpec, loops: Sequence[MeasuredLoop], design_states: int 
     return verdicts + [v for loop in stuck for v in judge(spec, loop, "design plant", stuck=True)]
 
 
-def list_broken(verdicts: Sequence[LimitVerdict]) -> list[str]:
+def list_broken(verdicts: Sequence[LimitVerdict]) -> list[BindingLimit]:
     """Return the limits that are broken, with the plant that breaks them."""
-    return [verdict.label for verdict in verdicts if not verdict.met]
+    return [verdict.binding for verdict in verdicts if not verdict.met]
 
 
 def list_broken_limits(spec: ControllerSpec, loops: Sequence[MeasuredLoop], design_states: int) -> set[str]:
@@ -129,17 +147,17 @@ def list_broken_limits(spec: ControllerSpec, loops: Sequence[MeasuredLoop], desi
     return {verdict.limit.name for verdict in judge_all(spec, loops, design_states) if not verdict.met}
 
 
-def list_broken_figures(spec: ControllerSpec, states: Sequence[MeasuredLoop]) -> list[str]:
+def list_broken_figures(spec: ControllerSpec, states: Sequence[MeasuredLoop]) -> list[BindingLimit]:
     """Return the limits that the design plant's figures break, sliding and stuck if it has friction."""
     figures_only = replace(spec, passive_band_hz=None)
     return list_broken(judge_all(figures_only, states, len(states)))
 
 
-def list_active(spec: ControllerSpec, verdicts: Sequence[LimitVerdict]) -> list[str]:
+def list_active(spec: ControllerSpec, verdicts: Sequence[LimitVerdict]) -> list[BindingLimit]:
     """Return the limits that are met with no more than the reserve and a hundredth to spare."""
     near = {"figure": 1.0 - NEARLY_USED - spec.reserve, "curve": 1.0 - NEARLY_USED, "none": np.inf}
     return [
-        verdict.label
+        verdict.binding
         for verdict in verdicts
         if verdict.limit.usage(verdict.value, verdict.allowed) > near[verdict.limit.reserve]
     ]
@@ -147,40 +165,41 @@ def list_active(spec: ControllerSpec, verdicts: Sequence[LimitVerdict]) -> list[
 
 def explain_broken(
     spec: LoopSpec, verdicts: Sequence[LimitVerdict], design: MeasuredLoop, loop: Loop | DiscLoop
-) -> list[str]:
-    """Return each limit that is broken once: the figure of the plant that breaks it most, and the plants that do.
-    `loop` is the design plant's. What is broken most comes first; where a loop is unstable nothing else says more.
+) -> dict[str, str]:
+    """Return of each limit that is broken, by its name, the figure of the plant that breaks it most, and the plants
+    that do. `loop` is the design plant's. What is broken most comes first; where a loop is unstable nothing else says
+    more.
     """
     broken: dict[str, list[LimitVerdict]] = {}
     for verdict in sorted((verdict for verdict in verdicts if not verdict.met), key=lambda each: -each.severity):
         broken.setdefault(verdict.limit.name, []).append(verdict)
     if "stability" in broken:
         broken = {"stability": broken["stability"]}
-    texts = [
-        _explain(spec, worst, design, loop)
+    texts = {
+        name: _explain(spec, worst, design, loop)
         + _format_plants([each.plant for each in (worst, *less) if each.names_plant])
-        for worst, *less in broken.values()
-    ]
-    alone = list(broken) == ["min_friction_margin"]  # the tuner then gives the law that has most of it
-    return [f"{text}, the largest found at this bandwidth" for text in texts] if alone else texts
+        for name, (worst, *less) in broken.items()
+    }
+    if list(broken) == ["min_friction_margin"]:  # the tuner then gives the law that has most of it
+        return {name: f"{text}, the largest found at this bandwidth" for name, text in texts.items()}
+    return texts
 
 
-def join_labels(labels: Sequence[str]) -> str:
-    """Return limits, as `LimitVerdict.label` names them, each once with its plants."""
+def join_limits(binding: Sequence[BindingLimit]) -> str:
+    """Return limits, each once with its plants."""
     plants: dict[str, list[str]] = {}
-    for label in labels:
-        name, _, plant = label.removesuffix(")").partition(" (")
-        plants.setdefault(name, []).extend([plant] if plant else [])
+    for limit in binding:
+        plants.setdefault(limit.name, []).extend([limit.plant] if limit.plant else [])
     return ", ".join(name + _format_plants(named) for name, named in plants.items())
 
 
-def advise_easing(labels: Sequence[str], among: Collection[str] = LIFTABLE) -> str:
-    """Return what to write for other limits than these that bind, as `LimitVerdict.label` names them, all at once: to
-    ease only some lets the next one bind. Only those `among` are eased; "" where none binds.
+def advise_easing(binding: Sequence[BindingLimit], among: Collection[str] = LIFTABLE) -> str:
+    """Return what to write for other limits than these that bind, all at once: to ease only some lets the next one
+    bind. Only those `among` are eased; "" where none binds.
     """
-    names = dict.fromkeys(label.partition(" (")[0] for label in labels)
-    binding = [BY_NAME[name] for name in names if name in among and name in BY_NAME]
-    ways = [(verb, [limit.name for limit in binding if limit.sense == sense]) for verb, sense in EASED.items()]
+    names = dict.fromkeys(limit.name for limit in binding)
+    limits = [BY_NAME[name] for name in names if name in among and name in BY_NAME]
+    ways = [(verb, [limit.name for limit in limits if limit.sense == sense]) for verb, sense in EASED.items()]
     return " and ".join(f"{verb} {join_words(named)}" for verb, named in ways if named)
 
 

@@ -37,7 +37,14 @@ from seaopt.control.laws.friction import find_friction_margin
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.laws.plausibility import PlausibilityGate, is_number
 from seaopt.control.laws.realisation import check_guards
-from seaopt.control.laws.verdict import LimitVerdict, explain_broken, judge_all, list_broken, shorten_blocked
+from seaopt.control.laws.verdict import (
+    BindingLimit,
+    LimitVerdict,
+    explain_broken,
+    judge_all,
+    list_broken,
+    shorten_blocked,
+)
 from seaopt.control.loops.absolute_stability import FrictionMargin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
 from seaopt.control.loops.compensation.terms import Compensation
@@ -240,7 +247,7 @@ class ForceMPC(ReadsLink, Result, Worded):
         return all(verdict.met for verdict in self.verdicts)
 
     @property
-    def broken(self) -> tuple[str, ...]:
+    def broken(self) -> tuple[BindingLimit, ...]:
         """The limits that are broken, with the state of the design plant that breaks them."""
         return tuple(list_broken(self.verdicts))
 
@@ -250,7 +257,7 @@ class ForceMPC(ReadsLink, Result, Worded):
         if self.met:
             return ""
         loop = next(iter(self.loops.values()))
-        blocked = shorten_blocked(explain_broken(self.spec, self.verdicts, self.measured_loops[0], loop))
+        blocked = shorten_blocked([*explain_broken(self.spec, self.verdicts, self.measured_loops[0], loop).values()])
         remedy = (
             f"{self.possible_hz:.4g} Hz is possible (tuned, not certified)"
             if self.possible_hz is not None

@@ -131,7 +131,7 @@ def tune(
     Returns
     -------
     Controller
-        With `feasible` False, and the limits that block in `active_constraints`, when the limits cannot all be met;
+        With `feasible` False, and the limits that block in `binding`, when the limits cannot all be met;
         it is then the controller that misses them least, and `possible` has the bandwidths that keep them.
 
     Raises
@@ -501,12 +501,12 @@ def describe_law(
         spec=spec,
         achieved=loops[0].figures if task.moved is None else replace(task, moved=None).measure_figures(law),
         met=not broken,
-        active_constraints=tuple(broken or list_active(spec, verdicts)),
+        binding=tuple(broken or list_active(spec, verdicts)),
         robust_to=task.names[task.design_states :],
         design=None if isinstance(plant, MeasuredResponse) else (plant, params),
         measured_on=(name_design(plant), params) if isinstance(plant, MeasuredResponse) else None,
         observer=observer,
-        blocked_by=tuple(_explain_rest(task, text) for text in explanations),
+        blocked_by=tuple(_explain_rest(task, limit, text) for limit, text in explanations.items()),
         possible=None if not broken else possible,
         measured=measure_all_discs(task.plants, law, spec.bandwidth_hz),
         link=task.link,
@@ -534,14 +534,14 @@ def _has_unheld(task: Task) -> bool:
     return task.spec.structure != "pd" and any(still < FALLS * moving for still, moving in gains)
 
 
-def _explain_rest(task: Task, text: str) -> str:
+def _explain_rest(task: Task, limit: str, text: str) -> str:
     """Return what is said of a broken limit; of a noise gain, or of a stability, that no integral keeps, that, too."""
-    if text.startswith("stability") and _has_unheld(task):
+    if limit == "stability" and _has_unheld(task):
         return (
             f"{text}: nothing holds the link there, so that no effort lasts on it, and an integral drifts; take "
             'structure = "pd", or leave that plant out of robust_to'
         )
-    at_rest = _find_rest_gain(task) if text.startswith("max_noise_gain") else None
+    at_rest = _find_rest_gain(task) if limit == "max_noise_gain" else None
     if at_rest is None:
         return text
     return f"{text}, where any integral makes {at_rest:.4g}: give max_noise_gain = {math.ceil(1.01 * at_rest)}"

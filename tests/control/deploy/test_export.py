@@ -21,6 +21,7 @@ from seaopt.control.deploy.export import export
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.laws.stored import read_controller
 from seaopt.control.laws.structures import DisturbanceObserver, Nominal, Notch, Prefilter
+from seaopt.control.laws.verdict import BindingLimit
 from seaopt.errors import ControlError, FileError
 from seaopt.files import to_json
 from tests.c_code import STRICT, CompiledLaw
@@ -245,7 +246,7 @@ def test_a_gate_answers_by_status_and_begins_at_zero_where_a_reset_cannot_be_bel
 
 
 def test_an_infeasible_controller_is_refused_unless_asked(tuned, tmp_path):
-    missed = replace(tuned, met=False, active_constraints=("max_noise_gain",))
+    missed = replace(tuned, met=False, binding=(BindingLimit(name="max_noise_gain"),))
     with pytest.raises(ControlError, match="misses max_noise_gain"):
         export(missed, tmp_path)
     assert not list(tmp_path.iterdir())

@@ -102,7 +102,7 @@ def test_it_comes_to_its_reference_against_friction(mpc, stand, rubbing):
 def test_a_broken_limit_is_named_with_the_bandwidth_that_keeps_it(stand, thor):
     fast = made(stand, thor, bandwidth_hz=40.0)
     assert not fast.feasible
-    assert set(fast.broken) == {"max_sensitivity (design plant)", "max_complementary (design plant)"}
+    assert set(map(str, fast.broken)) == {"max_sensitivity (design plant)", "max_complementary (design plant)"}
     s, t, _ = close_by_hand(fast, thor, 0.0)
     assert np.max(s) > 1.7 and np.max(t) > 1.3
     assert (
@@ -118,7 +118,7 @@ def test_false_lifts_a_limit_and_is_said(stand, thor):
     assert lifted.feasible
     assert [note.split(" = ")[0] for note in lifted.notes] == ["max_sensitivity", "max_complementary"]
     tight = made(stand, thor, max_reference_peak=1.2, max_noise_gain=1.0, min_disk_margin=0.5)
-    assert tight.broken == ("max_noise_gain",)
+    assert [str(limit) for limit in tight.broken] == ["max_noise_gain"]
     assert {verdict.limit.name for verdict in tight.verdicts} >= {"max_droop_db", "shoulder_hz", "min_disk_margin"}
 
 
@@ -127,7 +127,7 @@ def test_a_plan_of_few_currents_that_misses_the_bandwidth_is_not_feasible(stand,
     _, _, tracking = close_by_hand(crude, thor, 0.0)
     reached = F[np.argmax(tracking < np.sqrt(0.5))]
     assert reached < 0.97 * 20.0
-    assert not crude.feasible and "bandwidth_hz" in crude.broken and "bandwidth_hz" in crude.explanation
+    assert not crude.feasible and "bandwidth_hz" in map(str, crude.broken) and "bandwidth_hz" in crude.explanation
     bandwidth = next(line for line in repr(crude).splitlines() if line.startswith("  Bandwidth"))
     assert float(bandwidth.split()[1]) == pytest.approx(reached, rel=3e-3)
     assert {v.limit.name: v.value for v in crude.verdicts}["bandwidth_hz"] == pytest.approx(reached, rel=3e-3)
@@ -137,7 +137,7 @@ def test_every_copy_is_judged_by_its_own_specification(mpc):
     """A controller whose specification is replaced is held against the new one, and none is left unjudged."""
     tightened = replace(mpc, spec=replace(mpc.spec, max_sensitivity=1.1))
     assert mpc.feasible and not tightened.feasible
-    assert all(label.startswith("max_sensitivity") for label in tightened.broken)
+    assert all(limit.name == "max_sensitivity" for limit in tightened.broken)
     with pytest.raises((TypeError, ValueError)):
         replace(mpc, verdicts=())
 

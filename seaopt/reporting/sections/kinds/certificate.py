@@ -171,7 +171,7 @@ def advise(row: Requirement, *controllers: Controller, models: Plants) -> str:
         unmet = [text for law in controllers if not law.met for text in law.blocked_by]
         remedy = f"the tuning says why: {unmet[0]}" if unmet else limit.remedy
     among = EASED_BY.get(row.name, ()) if limit is None else limit.eased_by
-    easing = advise_easing([label for law in controllers for label in law.active_constraints], among)
+    easing = advise_easing([limit for law in controllers for limit in law.binding], among)
     return f"{remedy}, or {easing}" if easing else remedy
 
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.command import describe_cascade, name_gain_units
-from seaopt.control.laws.verdict import advise_easing, join_labels, list_design_figures
+from seaopt.control.laws.verdict import advise_easing, join_limits, list_design_figures
 from seaopt.control.loops.law import describe_integrators
 from seaopt.formatting import MISSING, format_band, format_count, format_figure, format_number
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Step, Table, Verdict, list_notes
@@ -24,7 +24,7 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
     if controller.met:
         on = " on measured points" if controller.design is None else ""
         return Verdict(met=True, text=f"{name}, every limit met{on}")
-    blocked = controller.blocked_by or (join_labels(controller.active_constraints),)
+    blocked = controller.blocked_by or (join_limits(controller.binding),)
     reasons = [Reason(what=text) for text in blocked]
     return Verdict(
         met=False,
@@ -91,8 +91,8 @@ def _advise_bandwidth(controller: Controller, commands: Commands) -> tuple[Step,
     if possible.nearest_hz:
         nearest = min(possible.nearest_hz, key=lambda hz: abs(hz - wanted_hz))
         return (first, show_costs(wanted_hz, commands, first=f"bandwidth_hz = {nearest:.4g} in [controller], or "))
-    unstable = any(name.startswith("stability") for name in controller.active_constraints)
-    easing = "" if unstable else advise_easing(controller.active_constraints)  # figures of no stable law bind nothing
+    unstable = any(limit.name == "stability" for limit in controller.binding)
+    easing = "" if unstable else advise_easing(controller.binding)  # figures of no stable law bind nothing
     return (first, show_costs(wanted_hz, commands, first=f"{easing} in [controller]; " if easing else ""))
 
 
@@ -132,7 +132,7 @@ def describe(controller: Controller) -> list[Section]:
         f"{command.mechanics.word.capitalize()} of the motor F_m = C_r F_ref − C_y {spec.regulated}; {command.input} = "
         f"{command.per_effort:.6g} {command.per_effort_unit} × F_m."
     )
-    active, head = join_labels(controller.active_constraints) or "none", (controller.judged_on, "achieved", "asked")
+    active, head = join_limits(controller.binding) or "none", (controller.judged_on, "achieved", "asked")
     return [
         Section(
             title="Controller",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from seaopt.control import ForceMPC
-from seaopt.control.laws.verdict import join_labels
+from seaopt.control.laws.verdict import join_limits
 from seaopt.formatting import format_count, format_number
 from seaopt.reporting.sections.data import Commands, Reason, Section, Table, Verdict, list_notes, mark_met, show_limit
 from seaopt.units import unit_after
@@ -16,7 +16,7 @@ def judge(mpc: ForceMPC, commands: Commands) -> Verdict:
         return Verdict(met=True, text=f"{name}, every limit met")
     return Verdict(
         met=False,
-        text=f"{name}, {format_count(len(mpc.broken), 'limit')} not met: {join_labels(mpc.broken)}",
+        text=f"{name}, {format_count(len(mpc.broken), 'limit')} not met: {join_limits(mpc.broken)}",
         reasons=(Reason(what=mpc.explanation),),
     )
 
