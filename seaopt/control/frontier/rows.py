@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Mapping
 from typing import Any
 
+from seaopt.codec import Key, OrInfinite, check_agrees, read_fields, to_content
 from seaopt.control.frontier.free_law import FreeLaw
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.loops.law import Law
-from seaopt.control.scheduling.scheduled_controller import ScheduledController
+from seaopt.control.scheduling.scheduled_controller import Plants, ScheduledController
 from seaopt.control.tuning.optimisation_problem import Task
-from seaopt.control.tuning.tuner import disturbance
+from seaopt.control.tuning.tuner import Draws, disturbance
+from seaopt.errors import FileError
+from seaopt.frequency import MeasuredResponse
+from seaopt.parameters import ParameterSet
+from seaopt.plants import Plant
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.units import LINEAR, Mechanics
 
 FRONTIER_SCHEMA = "seaopt/frontier/1"
+FILE, SWEEP_AGAIN = "frontier.json", "run its sweep again"
 
 
 @record
 class SlidingAlone(Result):
     """The best law for the sliding plants alone: whether limits are met, noise gain and disturbance, as in a row."""
 
+    json_keys = ("met", "noise_gain", "disturbance", "feasible")
+
     met: bool
-    noise_gain: float
-    disturbance: float
+    noise_gain: OrInfinite
+    disturbance: OrInfinite
 
 
 @record
@@ -33,13 +41,19 @@ class FrontierRow(Result):
     the place, of its points and the values between them that are judged, where it is worst.
     """
 
+    json_keys = (
+        *("bandwidth_hz", "met", "noise_gain", "ms", "ms_plant", "ms_place", "disturbance"),
+        *("sensitivity_bandwidth_hz", "phase_margin_deg", "disk_margin", "force_limit_N", "blocked_by"),
+        *("without_sticking", "free_law", "feasible"),
+    )
+
     bandwidth_hz: float
     met: bool  # whether every limit is met; if not, the figures are those of the controller that misses them least
-    noise_gain: float  # N/N
-    ms: float  # ms, ms_plant: largest Ms of all plants, and whose it is
+    noise_gain: OrInfinite  # N/N
+    ms: OrInfinite  # ms, ms_plant: largest Ms of all plants, and whose it is
     ms_plant: str
     ms_place: float | None  # of a schedule: the value of its variable there
-    disturbance: float  # integral over ln f of abs(S) from 0.1 Hz to the bandwidth, worst plant
+    disturbance: OrInfinite  # integral over ln f of abs(S) from 0.1 Hz to the bandwidth, worst plant
     sensitivity_bandwidth_hz: float  # abs(S) stays below -3 dB up to here
     phase_margin_deg: float | None  # phase_margin_deg, disk_margin: as in `LoopFigures`
     disk_margin: float
@@ -52,16 +66,12 @@ class FrontierRow(Result):
     # disturbance, or with that objective to the noise gain, is what the structure costs, at most
     free_law: FreeLaw | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the row of frontier.json."""
-        fields, alone = asdict(self) | {"feasible": self.met}, self.without_sticking
-        return fields if alone is None else fields | {"without_sticking": asdict(alone) | {"feasible": alone.met}}
-
 
 @record(eq=False, repr=False)
 class Frontier(Result, Worded):
     """The rows of a sweep, and their controllers."""
 
+    json_keys = ("met", "over", "rows", Key(field="contents", name="controllers"))
     plot = PlotAccessor()
 
     rows: tuple[FrontierRow, ...]
@@ -78,15 +88,41 @@ class Frontier(Result, Worded):
         """Units and words of what the controllers command."""
         return self.controllers[0].command.mechanics if self.controllers else LINEAR
 
+    @property
+    def contents(self) -> tuple[Mapping[str, Any], ...]:
+        """What controller.json of each holds."""
+        return tuple(controller.to_dict() for controller in self.controllers)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of frontier.json (schema seaopt/frontier/1)."""
-        return {
-            "schema": FRONTIER_SCHEMA,
-            "met": self.met,
-            "over": self.over,
-            "rows": [row.to_dict() for row in self.rows],
-            "controllers": [controller.to_dict() for controller in self.controllers],
-        }
+        return {"schema": FRONTIER_SCHEMA} | to_content(self)
+
+    @classmethod
+    def from_dict(
+        cls,
+        content: Mapping[str, Any],
+        plant: Plant | MeasuredResponse,
+        params: ParameterSet,
+        others: Plants | None = None,
+        draws: Draws = (),
+    ) -> Frontier:
+        """Return the sweep of a frontier.json; nothing is tuned. The arguments are those of the `from_dict` of its
+        controllers, of which `others` and `draws` are a schedule's. Raises FileError: a field is missing or malformed,
+        or contradicts another.
+        """
+        read = read_fields(cls, content, FILE, remedy=SWEEP_AGAIN)
+        tuned: list[Any] = content.get("controllers") or []
+        if len(tuned) != len(read["rows"]):
+            raise FileError(f"{FILE}: controllers has {len(tuned)} entries for {len(read['rows'])} rows; {SWEEP_AGAIN}")
+        if read["over"] is None:
+            controllers = tuple(Controller.from_dict(each, plant, params) for each in tuned)
+        elif isinstance(plant, Plant):
+            controllers = tuple(ScheduledController.from_dict(each, plant, params, others, draws) for each in tuned)
+        else:
+            raise FileError(f"{FILE}: over = {read['over']}: schedules are of a model; give the design plant")
+        frontier = cls(**read, controllers=controllers)
+        check_agrees(content, to_content(frontier), FILE, remedy=SWEEP_AGAIN)
+        return frontier
 
 
 def measure_disturbance(task: Task, law: Law) -> float:
