@@ -24,6 +24,7 @@ EXAMPLES = {
     "list": "[...]",
     "model": "{ ... }",
 }  # of a kind of value
+MOST_KEYS = 16  # of a table that a message lists
 MAX_SHOWN = 60  # characters of a wrong value that a message repeats
 # In a place of pydantic's these name what a value was tried as, and are no keys of the file.
 UNION_BRANCH = re.compile(
@@ -84,6 +85,9 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     if first["type"] == "extra_forbidden":
         keys = [field.alias or name for name, field in _find_model(model, first["loc"]).model_fields.items()]
         near = get_close_matches(str(first["loc"][-1]), keys, n=1, cutoff=0.6)
+        if not near and len(keys) > MOST_KEYS:
+            listed = f"seaopt schema problem, or the page Keys of a problem file, lists its {len(keys)}"
+            return f"unknown key {path}; no key of {_name_table(path)} is named alike: {listed}"
         line = f" write {near[0]} = {_spell(first['input'])}" if near else ""
         return f"unknown key {path}; {suggestion(str(first['loc'][-1]), keys)}{line}"
     if _is_range(first):
@@ -114,6 +118,12 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
     else:
         correct = f"correct it: {key} = {EXAMPLES.get(kind, '...')}"
     return f"{path} = {shorten(first['input'])}: {words}; {remedy or correct}"
+
+
+def _name_table(path: str) -> str:
+    """Return the table that a key is in, as a file has it."""
+    table = path.rpartition(".")[0]
+    return f"[{table}]" if table else "the top level"
 
 
 def _suggest_number(model: type[BaseModel], mistake: Mapping[str, Any]) -> str:

@@ -123,6 +123,11 @@ kind = "high_impedance"
     ("old", "new", "words"),
     [
         ("bandwidth_hz = 30", "bandwith_hz = 30", 'unknown key controller.bandwith_hz; did you mean "bandwidth_hz"'),
+        (
+            "bandwidth_hz = 30",
+            "bandwidth_hz = 30\nzzz = 1",
+            r"controller\.zzz; no key of \[controller\] is named alike: seaopt schema problem, .*, lists its \d+$",
+        ),
         ("bandwidth_hz = 30", "bandwidth_hz = 80", "bandwidth_hz = 80 is outside 15 to 60"),
         ("bandwidth_hz = 30\n", "", "controller.bandwidth_hz is missing"),
         ('unit = "kg m^2", free', 'unit = "kg m^3", free', "kg m\\^3"),
