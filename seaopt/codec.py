@@ -216,7 +216,7 @@ def _translate(hint: Any) -> Any:
     if origin in (dict, Mapping):
         return dict[_translate(arguments[0]), _translate(arguments[1])]
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
-        return _translate_array(hint, Flag if "bool" in hint.dtypes else Number)
+        return _translate_array(hint, {bool: Flag, int: Whole, float: Number}[_find_kind(hint)])
     if hasattr(hint, "_from_json"):
         content = get_type_hints(hint._from_json, include_extras=True)["content"]
         content = Annotated[content, Fields(of=hint)] if content == Mapping[str, Any] else content
@@ -258,7 +258,7 @@ def _translate_array(hint: type[AbstractArray], number: Any) -> Any:
 
     def convert(rows: Any) -> np.ndarray:
         try:
-            array = np.array(rows, dtype=bool if "bool" in hint.dtypes else float)
+            array = np.array(rows, dtype=_find_kind(hint))
         except ValueError:
             raise ValueError("should have rows of one length") from None
         return array if free else array.reshape(array.shape + (0,) * (len(hint.dims) - array.ndim))  # [] has no columns
@@ -269,6 +269,10 @@ def _translate_array(hint: type[AbstractArray], number: Any) -> Any:
     for _ in hint.dims[1:]:
         rows = list[rows]
     return Annotated[rows, AfterValidator(convert)]
+
+
+def _find_kind(hint: type[AbstractArray]) -> type[bool] | type[int] | type[float]:
+    return bool if "bool" in hint.dtypes else int if "int64" in hint.dtypes else float
 
 
 def _explain(build: Callable[[Any], Any]) -> Callable[[Any], Any]:

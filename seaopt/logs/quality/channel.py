@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from seaopt.codec import Key, OrNaN
 from seaopt.logs.quality import faults
 from seaopt.logs.quality.faults import CounterLosses, Rail, RowRanges
 from seaopt.logs.quality.spectra import Hum
@@ -21,13 +22,31 @@ BEYOND = 1e30  # in SI: more than any sensor gives, and with a square that is st
 class ChannelQuality:
     """Range and faults of one channel, in its SI unit; rows are counted from 0."""
 
+    json_keys = (
+        *("name", "unit", "low", "high", "mean", "std"),
+        Key(field="missing_samples", name="missing"),
+        "constant",
+        Key(field="quantum", name="quantisation"),
+        "held",
+        Key(field="stuck_samples", name="stuck"),
+        *("saturated", "rails"),
+        Key(field="outlying_samples", name="outliers"),
+        "hum",
+        Key(field="missing", name="missing_rows"),
+        Key(field="beyond", name="beyond_rows"),
+        "still",
+        Key(field="stuck", name="stuck_rows"),
+        Key(field="outliers", name="outlier_rows"),
+        "counter",
+    )
+
     name: str
     unit: str
     # low, high, mean, std: of the samples that are there; NaN where none is
-    low: float
-    high: float
-    mean: float
-    std: float
+    low: OrNaN
+    high: OrNaN
+    mean: OrNaN
+    std: OrNaN
     missing: RowRanges  # samples that are not finite
     beyond: Int[np.ndarray, " b"]  # rows of numbers that no sensor gives; no figure is made of them
     # What follows is a constant's, which has no faults besides.
@@ -51,9 +70,24 @@ class ChannelQuality:
         return self.std > 0.0 and self.counter is None
 
     @property
+    def missing_samples(self) -> int:
+        """Samples that are not finite."""
+        return self.missing.samples
+
+    @property
+    def stuck_samples(self) -> int:
+        """Samples in runs of equal ones."""
+        return self.stuck.samples
+
+    @property
+    def outlying_samples(self) -> int:
+        """Samples that are outliers."""
+        return int(self.outliers.size)
+
+    @property
     def saturated(self) -> int:
         """Samples at rails."""
-        return sum(rail.runs.samples for rail in self.rails)
+        return sum(rail.samples for rail in self.rails)
 
 
 def assess_channel(signal: Signal) -> ChannelQuality:

@@ -49,7 +49,7 @@ class ThirdOctave:
 class InputExcitation:
     """The bands of one input; `output` is the one whose gains they have, "" where there is none."""
 
-    json_keys = (Key(field="usable_hz", name="told_hz"), "sentence", "bands")
+    json_keys = (Key(field="usable_hz", name="told_hz"), "sentence", "bands", "channel", "nyquist_hz", "output")
 
     channel: str
     bands: tuple[ThirdOctave, ...]

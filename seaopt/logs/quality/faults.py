@@ -59,10 +59,17 @@ class RowRanges:
 class Rail:
     """Samples piled up at an extreme value; `clear`: three or more visits, where samples otherwise differ."""
 
+    json_keys = ("side", "value", "samples", "clear", "runs")
+
     side: str
     value: float
     runs: RowRanges
     clear: bool
+
+    @property
+    def samples(self) -> int:
+        """Samples in all runs."""
+        return self.runs.samples
 
 
 @record(eq=False)

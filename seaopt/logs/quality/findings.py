@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from typing import Any, Literal
 
@@ -64,10 +63,6 @@ class Finding:
     unit: str = ""
     where_s: tuple[tuple[float, float], ...] = ()
     keys: tuple[dict[str, Any], ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the finding as plain data."""
-        return asdict(self)
 
 
 def find_clock_faults(clock: ClockQuality, time: VectorN, channels: Iterable[ChannelQuality] = ()) -> Iterator[Finding]:

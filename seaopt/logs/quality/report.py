@@ -1,6 +1,6 @@
 """The quality report of a log: every fault in the data made visible before it becomes a wrong parameter.
 
-It reads a `Log`, or a `Table` as a file holds it, whose time may repeat or run backwards. Nothing is changed.
+It reads a `Log`, or a `RawLog` as a file holds it, whose time may repeat or run backwards. Nothing is changed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.codec import to_content
+from seaopt.codec import check_agrees, read_fields, to_content
 from seaopt.errors import LogError, suggestion
 from seaopt.formatting import format_count
 from seaopt.logs.quality.channel import ChannelQuality, assess_channel
@@ -35,6 +35,7 @@ from seaopt.records import Result, Worded, record
 from seaopt.signals import HOLDING_NAMES, INPUT_NAMES, INPUT_UNITS, SAME_SIGN, Recording, VectorN
 
 QUALITY_SCHEMA = "seaopt/quality/1"
+FILE, INSPECT_AGAIN = "quality.json", "inspect the log again"
 CHANNELS, PAIRS = 0.6, 0.4  # of the time
 MOVING_STD = 0.05  # of its standard deviation over the log: what makes a channel move during a run of another
 MOST_PAIRED = 100  # outputs; of more only `SAME_SIGN` are correlated with each other
@@ -58,12 +59,16 @@ class Quality(Result, Worded):
         Each input with each other channel, and the moving with one another where they share a unit.
     excitation : mapping of input to InputExcitation
     spectra : Spectra or None
-        From which hum, pairs and excitation come; None where no segment is long enough.
+        From which hum, pairs and excitation come; None where no segment is long enough, or it was read from a file.
     findings : tuple of Finding
         The most severe first.
     notes : tuple of str
         What was done to the log before.
     """
+
+    json_keys = (
+        *("met", "source", "duration_s", "clock", "channels", "inputs", "pairs", "excitation", "findings", "notes"),
+    )
 
     source: str
     duration_s: float
@@ -72,7 +77,7 @@ class Quality(Result, Worded):
     inputs: tuple[str, ...]
     pairs: tuple[ChannelPair, ...]
     excitation: Mapping[str, InputExcitation]
-    spectra: Spectra | None
+    spectra: Spectra | None = None
     findings: tuple[Finding, ...]
     notes: tuple[str, ...] = ()
 
@@ -97,9 +102,7 @@ class Quality(Result, Worded):
         clock = self.clock
         return {
             "schema": QUALITY_SCHEMA,
-            "source": self.source,
             "samples": clock.samples,
-            "duration_s": self.duration_s,
             "rate_hz": clock.rate_hz,
             "jitter": {
                 "rms_s": clock.jitter_rms,
@@ -116,14 +119,18 @@ class Quality(Result, Worded):
             "duplicates": int(clock.repeated.size),
             "backwards": int(clock.backwards.size),
             "time_missing": int(clock.not_numbers.size),
-            "channels": {name: _channel_dict(channel) for name, channel in self.channels.items()},
-            "inputs": list(self.inputs),
-            "pairs": to_content(self.pairs),
-            "excitation": to_content(self.excitation),
-            "findings": [finding.to_dict() for finding in self.findings],
             "counts": dict(count_findings(self.findings)),
-            "notes": list(self.notes),
+            **to_content(self),
         }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Quality:
+        """Return the quality of a quality.json, without its spectra. Raises FileError: a field is missing or malformed,
+        or contradicts another.
+        """
+        quality = cls(**read_fields(cls, content, FILE, remedy=INSPECT_AGAIN))
+        check_agrees(content, quality.to_dict(), FILE, remedy=INSPECT_AGAIN)
+        return quality
 
 
 @np.errstate(over="ignore", invalid="ignore")  # numbers near the largest float have no std, and are reported as such
@@ -132,7 +139,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
 
     Parameters
     ----------
-    data : Log or Table
+    data : Log or RawLog
         `log.quality` is this with its defaults.
     inputs : sequence of str, optional
         Channels that drive the moving, and may hold a value. Left out: those named I, V, duty, goal, Fe1, Fe2 or u (a v
@@ -293,25 +300,3 @@ def _list_unjudged(
     else:
         return []
     return [Finding(kind="unjudged", severity="note", sentence=text)]
-
-
-def _channel_dict(channel: ChannelQuality) -> dict[str, Any]:
-    return {
-        "unit": channel.unit,
-        "low": channel.low,
-        "high": channel.high,
-        "mean": channel.mean,
-        "std": channel.std,
-        "missing": channel.missing.samples,
-        "constant": channel.constant,
-        "quantisation": channel.quantum,
-        "held": channel.held,
-        "stuck": channel.stuck.samples,
-        "saturated": channel.saturated,
-        "rails": [
-            {"side": rail.side, "value": rail.value, "samples": rail.runs.samples, "clear": rail.clear}
-            for rail in channel.rails
-        ],
-        "outliers": int(channel.outliers.size),
-        "hum": to_content(channel.hum),
-    }
