@@ -104,7 +104,7 @@ class Recording(Protocol):
 
 
 @record(eq=False)
-class Table:
+class RawLog:
     """Channels of one clock, as read: time may repeat, run backwards or be missing.
 
     Parameters

@@ -23,7 +23,7 @@ from seaopt.progress import divide
 from seaopt.reporting.sections import describe
 from seaopt.reporting.sections.data import Section
 from seaopt.reporting.sections.text import Most, render_sections
-from seaopt.signals import Table
+from seaopt.signals import RawLog
 from seaopt.units import is_unit, same_dimension, si_unit
 
 RULES: dict[str, Rule] = {"hold": Hold(), "linear": Linear()}
@@ -88,7 +88,7 @@ def inspect_log(
     return not any(finding.severity == "error" for finding in quality.findings)
 
 
-def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, unit: str | None) -> Table:
+def _read_on_clock(path: Path, read: Callable[..., RawLog], time: str | None, unit: str | None) -> RawLog:
     """Read a table; where its clock is not clear the error is the command to type, and its unit may be assumed. Raises
     LogError: no column, or more than one, is named like a time, or it has another unit.
     """
@@ -116,7 +116,7 @@ def _read_on_clock(path: Path, read: Callable[..., Table], time: str | None, uni
         return replace(table, notes=(note, *table.notes))
 
 
-def _take_units_of_names(table: Table) -> Table:
+def _take_units_of_names(table: RawLog) -> RawLog:
     """Return the table with the units that the names of channels without one end in, and a note of them."""
     units = {name: find_unit_in_name(name) for name, signal in table.signals.items() if not signal.unit}
     signals, taken = dict(table.signals), {name: unit for name, unit in units.items() if unit is not None}

@@ -23,7 +23,7 @@ SHORT = "short"  # kind of finding of a log that is much shorter than its siblin
 
 
 @record
-class Spread:
+class FigureSpread:
     """A parameter or figure over the logs that are met and identify it.
 
     Parameters
@@ -135,7 +135,7 @@ class Fleet(Result, Worded):
         return count_reasons(zip(*(bad[name].to_list() for name in ("log", "reason", "findings")), strict=True))
 
     @property
-    def spreads(self) -> tuple[Spread, ...]:
+    def spreads(self) -> tuple[FigureSpread, ...]:
         """How parameters and figures spread over the logs that are met."""
         met = self.rows.filter(pl.col("status") == MET)
         spreads = (_spread(name, unit, met) for name, unit in self.units.items() if name in met.columns)
@@ -175,12 +175,14 @@ def count_reasons(
     return tuple((examples[kind][0], count, examples[kind][1]) for kind, count in counts.most_common())
 
 
-def _spread(name: str, unit: str, met: pl.DataFrame) -> Spread | None:
+def _spread(name: str, unit: str, met: pl.DataFrame) -> FigureSpread | None:
     values, stds = select_known(met, name)
     if not values.size:
         return None
     low, median, high = np.quantile(values, (0.1, 0.5, 0.9)).tolist()
-    return Spread(name=name, unit=unit, logs=values.size, median=median, low=low, high=high, std=float(np.median(stds)))
+    return FigureSpread(
+        name=name, unit=unit, logs=values.size, median=median, low=low, high=high, std=float(np.median(stds))
+    )
 
 
 def select_known(rows: pl.DataFrame, name: str) -> tuple[VectorN, VectorN]:

@@ -9,10 +9,26 @@ from seaopt.logs.reading.column import Column
 from seaopt.logs.reading.counter import Counter
 from seaopt.logs.reading.listing import Contents, contents
 from seaopt.logs.reading.reader import read_log, read_table, write_log
-from seaopt.signals import Table
+from seaopt.signals import RawLog
 from seaopt.units import header_unit
 
 __all__ = [
-    "Column", "Contents", "Counter", "Finding", "Hold", "Linear", "Log", "Nearest", "Quality", "Readings", "Table",
-    "assess_quality", "concatenate", "contents", "header_unit", "read_log", "read_table", "write_log",
+    "Column",
+    "Contents",
+    "Counter",
+    "Finding",
+    "Hold",
+    "Linear",
+    "Log",
+    "Nearest",
+    "Quality",
+    "RawLog",
+    "Readings",
+    "assess_quality",
+    "concatenate",
+    "contents",
+    "header_unit",
+    "read_log",
+    "read_table",
+    "write_log",
 ]  # fmt: skip

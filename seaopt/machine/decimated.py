@@ -159,7 +159,7 @@ class Off:
 
 
 @record(eq=False)
-class Table:
+class LoggedPeriods:
     """The periods of a log, and what the law makes of them."""
 
     controller: Controller
@@ -173,7 +173,7 @@ class Table:
     @classmethod
     def make(
         cls, controller: Controller, ticks: Ticks, blocks: Blocks, ticks_per_row: int, outer: OuterLoop | None
-    ) -> Table:
+    ) -> LoggedPeriods:
         """Return the table of a log."""
         law = _enclose(controller.law, controller.signals, outer)
         responses = evaluate(law, blocks, ticks_per_row)
@@ -317,7 +317,7 @@ class Table:
         return float(np.sum(found.scale(self.average(chosen)) ** 2)) <= found.most
 
 
-def find_telling(table: Table, found: Off, others: Others, place: float) -> list[float | None]:
+def find_telling(table: LoggedPeriods, found: Off, others: Others, place: float) -> list[float | None]:
     """Return of each shift, and each command that is logged otherwise late, the frequency at which a line as strong as
     the others would tell it, by the loop of the design plant: the nearest to those that were played; None of it where
     none would.
@@ -377,7 +377,7 @@ def match_lines(setting: Setting, ticks_per_row: int, others: Others) -> LineMat
     dry, phases = has_dry_friction(controller), blocks.realisations
     if dry and phases >= LEAST_PHASES:
         blocks = blocks.average()
-    table = Table.make(controller, ticks, blocks, ticks_per_row, outer)
+    table = LoggedPeriods.make(controller, ticks, blocks, ticks_per_row, outer)
     tried = [table.try_late(late) for late in LATE]
     found, shifts = min(tried, key=lambda each: each.misfit), [*table.list_shifts(others, place)]
     every, possible = [*shifts, *table.list_late(found.late)], ()
@@ -462,7 +462,7 @@ def list_untold(
     return tuple(sorted(untold, key=lambda cause: -(cause.value or math.inf)))
 
 
-def list_possible(found: Off, shifts: Sequence[Shift], table: Table) -> tuple[Cause, ...]:
+def list_possible(found: Off, shifts: Sequence[Shift], table: LoggedPeriods) -> tuple[Cause, ...]:
     """Return the laws with another part that the log does not exclude beside the law, its command logged late or not:
     a filter that is slower is much like a command that is logged later.
     """

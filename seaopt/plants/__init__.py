@@ -10,11 +10,11 @@ from seaopt.plants.plant import CompletedParameters, Plant, jacobians, state_spa
 from seaopt.plants.published import thor
 from seaopt.plants.roles import Actuation, Friction, Mode, Port, Reading, Sensing, SeriesSpring, Winding
 from seaopt.plants.rotary import rotary
-from seaopt.plants.sensors.difference import Difference
+from seaopt.plants.sensors.difference import DifferencedSpeed
 from seaopt.plants.two_link import high_impedance, moving_output, two_link
 
 __all__ = [
-    "KINDS", "PARTS", "Actuation", "CompletedParameters", "Difference", "Friction", "Mode", "Modes",
+    "KINDS", "PARTS", "Actuation", "CompletedParameters", "DifferencedSpeed", "Friction", "Mode", "Modes",
     "MotorRating", "Plant", "Port", "Reading", "Resonance", "Sensing", "SeriesSpring", "Winding", "add_part",
     "export_fmu", "high_impedance", "jacobians", "known_parameters", "let_stick", "modes", "moving_output",
     "plant_of_kind", "rate_motor", "rotary", "state_space", "thor", "to_control", "two_link", "winding", "wrapped",

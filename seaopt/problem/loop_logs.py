@@ -17,7 +17,7 @@ from seaopt.logs.reading.selection import ClockError
 from seaopt.problem.bench_tables import ExperimentTable
 from seaopt.problem.columns import make_column
 from seaopt.problem.problem import Problem
-from seaopt.signals import REFERENCE, REFERENCES, STATUS, Table, VectorN
+from seaopt.signals import REFERENCE, REFERENCES, STATUS, RawLog, VectorN
 from seaopt.units import bare_name
 
 NUMBERS = ("float", "int", "uint")  # kinds of a column, before their bits
@@ -101,7 +101,7 @@ def _read_ticks(path: Path, time: Column | None, channels: Mapping[str, Column],
     return log
 
 
-def _number_rows(table: Table, rate_hz: float) -> Log:
+def _number_rows(table: RawLog, rate_hz: float) -> Log:
     """Return a log whose rows are ticks in the order in which they were written, whenever each was stamped, with gaps
     where the stamps tell them. Raises LogError: the stamps are of another rate.
     """

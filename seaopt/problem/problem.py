@@ -31,7 +31,7 @@ from seaopt.formatting import format_remedies
 from seaopt.frequency import MeasuredResponse, measure_response
 from seaopt.logs import Counter, Log, Readings, read_log
 from seaopt.parameters import Parameter, ParameterSet
-from seaopt.plants import Difference, Plant
+from seaopt.plants import DifferencedSpeed, Plant
 from seaopt.problem.bench_tables import (
     ColumnTable,
     EquationsTable,
@@ -330,7 +330,7 @@ class Problem:
             gain={name: _make_unknown(name, "-", gain) for name, gain in table.gain.items()},
             delay_s=_make_unknown("delay_s", "s", table.delay_s),
             parameters={name: self._make_own(plant, table, name, log) for name in table.parameters},
-            differences={name: make_record(Difference, difference) for name, difference in table.differences.items()},
+            differences={name: make_record(DifferencedSpeed, each) for name, each in table.differences.items()},
         )
 
     def _make_own(self, plant: Plant, table: ExperimentTable, name: str, log: Log) -> float | Parameter:
@@ -417,7 +417,7 @@ def _compute_speeds(log: Log, table: ExperimentTable) -> Log:
         if difference.of not in log.signals:
             near = suggestion(difference.of, log.signals)
             raise ProblemError(f'experiment {table.name}: differences: {name} is of "{difference.of}"; {near}')
-        values = make_record(Difference, difference).read(log[difference.of], log.period)
+        values = make_record(DifferencedSpeed, difference).read(log[difference.of], log.period)
         speeds[name] = Signal(name=name, values=values, unit=f"{log.signals[difference.of].unit}/s")
     return replace(log, signals={**log.signals, **speeds}) if speeds else log
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from seaopt.control import Frontier
 from seaopt.estimation import Fit
 from seaopt.frequency import Survey
-from seaopt.logs import Log, Quality, Table
+from seaopt.logs import Log, Quality, RawLog
 from seaopt.parameters import ParameterSet
 from seaopt.reporting.comparison import survey_panels
 from seaopt.reporting.drawing import write_figure
@@ -70,12 +70,12 @@ def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
     return write_figure(compose_sheet(frontier_panels(frontier), FRONTIER_COLUMNS, final=True), path)
 
 
-def write_quality_figure(data: Log | Table, quality: Quality, path: Path | str) -> list[Path]:
+def write_quality_figure(data: Log | RawLog, quality: Quality, path: Path | str) -> list[Path]:
     """Draw a quality report to SVG and PNG.
 
     Parameters
     ----------
-    data : Log or Table
+    data : Log or RawLog
         What the report was made of.
     quality : Quality
         The report.

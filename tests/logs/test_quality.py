@@ -15,7 +15,7 @@ import seaopt as so
 from seaopt.bench import PAPER_STAND, PAPER_SWING, Multisine, Noise
 from seaopt.errors import LogError
 from seaopt.files import to_json
-from seaopt.logs import Table, assess_quality
+from seaopt.logs import RawLog, assess_quality
 from seaopt.logs.log.saturation import mask_saturated
 from seaopt.logs.quality.channel import assess_channel
 from seaopt.logs.quality.clock import advise_clock, measure_steps, timestamp_resolution
@@ -38,7 +38,7 @@ def table(log, time=None, **changed):
     values = channels(log) | changed
     units = {name: signal.unit for name, signal in log.signals.items()}
     signals = {name: Signal(name=name, values=array, unit=units.get(name, "")) for name, array in values.items()}
-    return Table(time=log.time.copy() if time is None else time, signals=signals, source="test")
+    return RawLog(time=log.time.copy() if time is None else time, signals=signals, source="test")
 
 
 def grave(quality):
@@ -151,7 +151,7 @@ def test_samples_of_a_joint_that_stuck_are_to_be_left():
         speed = np.sign(driven) * max(abs(driven) - 2e-3, 0.0)
         position[k] = position[k - 1] + 1e-3 * speed
     signals = {"F": Signal(name="F", values=force, unit="N"), "x": Signal(name="x", values=position, unit="m")}
-    (finding,) = assess_quality(Table(time=time, signals=signals, source="test")).of("stuck")
+    (finding,) = assess_quality(RawLog(time=time, signals=signals, source="test")).of("stuck")
     assert finding.channel == "x"
     assert "If the joint stuck there, leave those samples, for a fit of friction needs them" in finding.sentence
 
@@ -272,7 +272,9 @@ def test_an_input_that_nothing_answers_to_is_a_warning():
 def test_a_counter_shows_lost_samples(recorded):
     def read(name):
         rows = np.genfromtxt(recorded("formats") / "acqtools" / name, delimiter=",", skip_header=1, max_rows=27)
-        return Table(time=1e-6 * rows[:, 0], signals={"msr": Signal(name="msr", values=rows[:, 1].copy())}, source=name)
+        return RawLog(
+            time=1e-6 * rows[:, 0], signals={"msr": Signal(name="msr", values=rows[:, 1].copy())}, source=name
+        )
 
     lost = assess_quality(read("Wmsr2_loss.csv"))
     gap = lost.of("gap")[0]
@@ -354,7 +356,7 @@ def test_whatever_the_numbers_a_report_or_a_seaopt_error(seed, pool, steps, n):
         "F2": Signal(name="F2", values=np.repeat(rng.choice(np.array(pool), -(-n // 3)), 3)[:n], unit="N"),
     }
     try:
-        quality = assess_quality(Table(time=time, signals=signals, source="any"))
+        quality = assess_quality(RawLog(time=time, signals=signals, source="any"))
     except LogError:
         return
     json.loads(to_json(quality.to_dict()))

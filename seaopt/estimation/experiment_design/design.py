@@ -39,7 +39,7 @@ from seaopt.records import record
 
 
 @record(eq=False, repr=False)
-class Comparison:
+class ExcitationComparison:
     """The expected result of another excitation, scaled to the design's rms.
 
     Parameters
@@ -109,7 +109,7 @@ class Design:
         """
         return scale(self.excitation, 0.5)
 
-    def against(self, excitation: Excitation, *, seed: int = 0) -> Comparison:
+    def against(self, excitation: Excitation, *, seed: int = 0) -> ExcitationComparison:
         """Compare with another excitation of equal rms, whatever its peaks.
 
         Parameters
@@ -124,7 +124,7 @@ class Design:
         trial = self.bench.refine_steps(u * factor).run(u * factor)
         names = self.covariance.names
         covariance = Covariance(names=names, matrix=trial.covariance)
-        return Comparison(
+        return ExcitationComparison(
             excitation=scale(excitation, factor),
             covariance=covariance,
             ratio={name: covariance.std(name) / self.covariance.std(name) for name in names},

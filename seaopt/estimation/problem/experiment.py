@@ -23,7 +23,7 @@ from seaopt.options import check_options, option
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import follow_readings
-from seaopt.plants.sensors.difference import Difference, add_difference, find_state
+from seaopt.plants.sensors.difference import DifferencedSpeed, add_difference, find_state
 from seaopt.records import record
 from seaopt.signals import measure_white
 from seaopt.simulation import Hold, Segment
@@ -117,10 +117,10 @@ class Experiment:
         '"split": a gap in the log starts a new segment with its own initial state; "error": it is refused.',
         default="split",
     )
-    differences: Mapping[str, Difference] = option(
+    differences: Mapping[str, DifferencedSpeed] = option(
         "Measured speeds that are differences of a position over samples of this log: outputs that the plant then has "
         "besides its own. What the device held before a segment's first sample is part of the initial state.",
-        default_factory=dict[str, Difference],
+        default_factory=dict[str, DifferencedSpeed],
     )
     feedback: bool = option(
         "Taken under a law that reads the outputs: the input carries their noise. Such a log is fitted as any other, "
@@ -239,7 +239,7 @@ class Experiment:
         plant, initial = self.plant, self.initial_state
         made = plant.sampling.differences if plant.sampling is not None else {}
         for name, difference in self.differences.items():
-            require_type(difference, Difference, f"{where}: {name}", "give a Difference", EstimationError)
+            require_type(difference, DifferencedSpeed, f"{where}: {name}", "give a DifferencedSpeed", EstimationError)
             if made.get(name, difference) != difference:
                 raise self._refuse(
                     f"differences: {name} = {difference}, but {plant.name} has it made already, as {made[name]}; "

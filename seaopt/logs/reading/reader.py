@@ -30,7 +30,7 @@ from seaopt.logs.reading.selection import (
     advise_time,
     select,
 )
-from seaopt.signals import STATUS, Origin, Signal, Table, VectorM, VectorN
+from seaopt.signals import STATUS, Origin, RawLog, Signal, VectorM, VectorN
 from seaopt.units import factor, si_unit
 
 
@@ -44,7 +44,7 @@ def read_table(
     counter: Counter | None = None,
     rate_hz: float | None = None,
     digest: bool = True,
-) -> Table:
+) -> RawLog:
     r"""Read a file as it is: time may repeat or run backwards, and a channel may be empty.
 
     Parameters
@@ -117,7 +117,7 @@ def read_table(
         notes += _remark_on(signals[name], at_rest=channel.file_column.column.at_rest)
     names = ", ".join(str(source.path) for source in sources)
     law = next((source.law for source in sources if source.law), "")
-    return Table(time=clock, signals=signals, source=names, notes=tuple(notes), law=law)
+    return RawLog(time=clock, signals=signals, source=names, notes=tuple(notes), law=law)
 
 
 def _open_sources(path: str | Path | Sequence[str | Path]) -> list[Source]:
@@ -195,7 +195,7 @@ def read_log(
         raise LogError(f'{error}; if "{clock.name}" is not the time, {advise_time(clock.source)}') from error
 
 
-def _merge_duplicates(table: Table, how: str) -> Table:
+def _merge_duplicates(table: RawLog, how: str) -> RawLog:
     """Return a table with one sample of each run of samples at one time, and a note of how many there were."""
     if how not in ("first", "mean"):
         raise LogError(f'duplicates = "{how}" is not known; give "first" or "mean"')

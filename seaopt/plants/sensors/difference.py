@@ -30,7 +30,7 @@ from seaopt.signals import VectorN
 
 
 @record
-class Difference:
+class DifferencedSpeed:
     """A speed that a device computed from a position, sample by sample.
 
     Raises
@@ -41,7 +41,7 @@ class Difference:
     Examples
     --------
     >>> import numpy as np
-    >>> Difference(of="theta_m").read(np.array([0.0, 0.1, 0.3]), 0.01)
+    >>> DifferencedSpeed(of="theta_m").read(np.array([0.0, 0.1, 0.3]), 0.01)
     array([ 0., 10., 20.])
     """
 
@@ -52,8 +52,8 @@ class Difference:
     )
 
     def __post_init__(self) -> None:
-        require_type(self.of, str, "of (of a Difference)", "give the name of a position", PlantError)
-        check_options(self, PlantError, "Difference: ")
+        require_type(self.of, str, "of (of a DifferencedSpeed)", "give the name of a position", PlantError)
+        check_options(self, PlantError, "DifferencedSpeed: ")
 
     def share(self, period_s: float) -> float:
         """Return a: how much of the way to each difference the lag goes; 1 without one."""
@@ -75,7 +75,7 @@ class Difference:
 
 
 @memo
-def add_difference(plant: Plant, name: str, difference: Difference, period_s: float) -> Plant:
+def add_difference(plant: Plant, name: str, difference: DifferencedSpeed, period_s: float) -> Plant:
     """Return a plant with one more output: the speed that a device which samples with this period computes. Raises
     PlantError: the plant has such an output, or no such position, or samples with another period.
     """
@@ -107,7 +107,7 @@ def add_difference(plant: Plant, name: str, difference: Difference, period_s: fl
     )
 
 
-def read_positions(plant: Plant, differences: Mapping[str, Difference]) -> Plant:
+def read_positions(plant: Plant, differences: Mapping[str, DifferencedSpeed]) -> Plant:
     """Return a plant with differences in which these outputs are the positions themselves."""
     states = {name: find_state(plant, difference.of) for name, difference in differences.items()}
     return extend(plant, readings=lambda t, x, u, p: {name: getattr(x, state) for name, state in states.items()})

@@ -10,7 +10,7 @@ from seaopt.problem.proposal.roles import Assignment
 from seaopt.problem.proposal.survey import LogSurvey
 from seaopt.problem.proposal.traits import Traits
 from seaopt.records import record
-from seaopt.signals import Signal, Table, VectorN
+from seaopt.signals import RawLog, Signal, VectorN
 from seaopt.units import factor
 
 GEARED = (1.5, 1000.0)  # slopes of motor over link that are a gear's
@@ -52,14 +52,14 @@ class DescribedLog:
         return {role: column.values * self.si_scale(role) for role, column in self.roles.columns.items()}
 
 
-def make_table(log: DescribedLog, outputs: Sequence[str]) -> Table | None:
+def make_table(log: DescribedLog, outputs: Sequence[str]) -> RawLog | None:
     """Return the input and some outputs on the log's clock, in SI; None of a log without one."""
     if log.survey.clock is None:
         return None
     time = log.survey.clock.values * factor(log.time_unit, "s")
     signals = log.signals
     channels = {name: Signal(name=name, values=signals[name].copy(), unit="") for name in (log.roles.input, *outputs)}
-    return Table(time=time, signals=channels, source=log.survey.name)
+    return RawLog(time=time, signals=channels, source=log.survey.name)
 
 
 def list_single(logs: Sequence[DescribedLog]) -> list[DescribedLog]:

@@ -16,7 +16,7 @@ from seaopt.logs import Quality, assess_quality
 from seaopt.logs.quality.excitation import InputExcitation
 from seaopt.logs.quality.spectra import Spectra
 from seaopt.records import record
-from seaopt.signals import Table
+from seaopt.signals import RawLog
 
 COHERENT = 0.9
 BAND = 3.0  # highest over lowest frequency of the line
@@ -38,7 +38,7 @@ class Traits:
 
 
 def find_traits(
-    table: Table, source: str, outputs: Sequence[str], positions: Sequence[str], *, is_command: bool
+    table: RawLog, source: str, outputs: Sequence[str], positions: Sequence[str], *, is_command: bool
 ) -> Traits:
     """Return the traits of a log. `outputs`: what is fitted. `positions`: which of it are positions. `is_command`:
     whether the input holds each value until the next sample; a measured one does not.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from seaopt.logs import Log, Quality, Table
+from seaopt.logs import Log, Quality, RawLog
 from seaopt.logs.quality.clock import ClockQuality
 from seaopt.logs.quality.faults import RowRanges
 from seaopt.reporting.figures.fit import label_channel
@@ -24,7 +24,7 @@ MOST_MARKS = 200  # marks of a kind in a panel: more are a blur
 DRAWN = 1e100  # the largest number that a figure's axes are laid out for
 
 
-def log_panels(data: Log | Table, quality: Quality) -> list[Panel]:
+def log_panels(data: Log | RawLog, quality: Quality) -> list[Panel]:
     """Return the clock and the excitation, then each channel over time and its spectrum."""
     panels = [clock_panel(data, quality), excitation_panel(quality)]
     for name in quality.channels:
@@ -32,7 +32,7 @@ def log_panels(data: Log | Table, quality: Quality) -> list[Panel]:
     return panels
 
 
-def clock_panel(data: Log | Table, quality: Quality) -> Panel:
+def clock_panel(data: Log | RawLog, quality: Quality) -> Panel:
     """Draw the steps of time against the period, gaps as marks: they would flatten all else."""
     clock, time = quality.clock, data.time
 
@@ -88,7 +88,7 @@ def excitation_panel(quality: Quality) -> Panel:
     )
 
 
-def channel_panel(data: Log | Table, quality: Quality, name: str) -> Panel:
+def channel_panel(data: Log | RawLog, quality: Quality, name: str) -> Panel:
     """Draw one channel over time, with its faults marked."""
     channel, time = quality.channels[name], data.time
     values = np.clip(data.signals[name].values, -DRAWN, DRAWN)

@@ -13,7 +13,7 @@ from scipy.signal import cont2discrete, lfilter
 
 import seaopt as so
 from seaopt.errors import EstimationError, PlantError, SimulationError
-from seaopt.plants import Difference
+from seaopt.plants import DifferencedSpeed
 from seaopt.plants.sensors.difference import add_difference
 from seaopt.simulation import Clock, Point, Segment, make_model, run_passes
 from seaopt.simulation.interpreted import interpret_pass
@@ -23,9 +23,9 @@ PERIOD, N = 4e-3, 4000
 TRUTH = {"J_m": 2e-4, "b_r": 1e-3, "N": 50.0, "k_s": 300.0, "c_s": 0.3, "J_l": 0.1, "d_l": 0.2}
 FREE = ("J_m", "k_s", "c_s", "J_l", "d_l")
 CASES = {
-    "one sample": Difference(of="theta_m"),
-    "three samples": Difference(of="theta_m", samples=3),
-    "with a lag": Difference(of="theta_m", samples=2, lag_hz=15.0),
+    "one sample": DifferencedSpeed(of="theta_m"),
+    "three samples": DifferencedSpeed(of="theta_m", samples=3),
+    "with a lag": DifferencedSpeed(of="theta_m", samples=2, lag_hz=15.0),
 }
 
 
@@ -144,7 +144,7 @@ def test_taken_for_the_state_s_speed_it_is_half_a_sample_late(motion):
     late = so.fit([record(motion, speed, plant=naive, delay_s=delay)], params, diagnostics=False)
     assert late.nuisance["experiment"].delay_s == pytest.approx(0.5 * PERIOD, rel=0.05)
     wrong = so.fit([record(motion, speed, plant=naive)], params, diagnostics=False)
-    right = so.fit([record(motion, speed, plant=plant, differences={"speed": Difference(of="theta_m")})], params,
+    right = so.fit([record(motion, speed, plant=plant, differences={"speed": DifferencedSpeed(of="theta_m")})], params,
                    diagnostics=False)  # fmt: skip
     far = [abs(wrong.parameters[n].value - TRUTH[n]) / right.parameters[n].std for n in FREE]
     near = [abs(right.parameters[n].value - TRUTH[n]) / right.parameters[n].std for n in FREE]
@@ -189,7 +189,7 @@ def test_a_known_start_was_there_before(motion):
     log = so.Log.from_arrays(time=np.arange(50) * PERIOD, I=np.zeros(50), speed=np.zeros(50))
     one = so.Experiment(
         plant=so.plants.rotary(), log=log, outputs=("speed",), initial_state={"theta_m": 5.0, "theta_l": 0.1},
-        differences={"speed": Difference(of="theta_m", samples=2)},
+        differences={"speed": DifferencedSpeed(of="theta_m", samples=2)},
     )  # fmt: skip
     assert one.initial_state == {"theta_m": 5.0, "theta_l": 0.1, "speed_held_1": 5.0, "speed_held_2": 5.0}
 
@@ -204,7 +204,7 @@ def test_a_known_start_is_that_of_an_output_which_is_the_state():
     log = so.Log.from_arrays(time=np.arange(50) * PERIOD, F=np.zeros(50), speed=np.zeros(50))
     one = so.Experiment(
         plant=cart, log=log, outputs=("speed",), initial_state={"x": 0.3},
-        differences={"speed": Difference(of="place", samples=2)},
+        differences={"speed": DifferencedSpeed(of="place", samples=2)},
     )  # fmt: skip
     assert one.initial_state == {"x": 0.3, "speed_held_1": 0.3, "speed_held_2": 0.3}
     run = so.simulate(one.plant, one.plant.defaults, log, initial_state=dict(one.initial_state))
@@ -223,15 +223,15 @@ def test_the_response_is_that_of_the_recursion():
 def test_what_cannot_be_differenced_is_refused(motion, tmp_path):
     plant, params = start()
     speed = motion[2]
-    one = record(motion, speed, plant=plant, differences={"speed": Difference(of="theta_m")})
+    one = record(motion, speed, plant=plant, differences={"speed": DifferencedSpeed(of="theta_m")})
     with pytest.raises(EstimationError, match=r"PredictionError.*OutputError"):
         so.fit([one], params, method=so.PredictionError())
     with pytest.raises(PlantError, match='no position "theta_x"'):
-        record(motion, speed, plant=plant, differences={"speed": Difference(of="theta_x")})
+        record(motion, speed, plant=plant, differences={"speed": DifferencedSpeed(of="theta_x")})
     with pytest.raises(PlantError, match="is no state"):
-        record(motion, speed, plant=plant, differences={"speed": Difference(of="tau_s")})
+        record(motion, speed, plant=plant, differences={"speed": DifferencedSpeed(of="tau_s")})
     with pytest.raises(PlantError, match="samples = 0"):
-        Difference(of="theta_m", samples=0)
+        DifferencedSpeed(of="theta_m", samples=0)
     for use in (
         one.plant.linearize,
         lambda params: so.plants.to_control(one.plant, params),
@@ -297,7 +297,7 @@ def test_a_plant_of_one_s_own_in_symbols_has_one():
         parameters={"m": so.Parameter(name="m", value=2.0, unit="kg")},
         f=lambda t, x, u, p: {"x": x.v, "v": (u.F - ca.tanh(x.v)) / p.m}, h=lambda t, x, u, p: {"place": x.x},
     )  # fmt: skip
-    observed = add_difference(plant, "w", Difference(of="place"), 0.01)
+    observed = add_difference(plant, "w", DifferencedSpeed(of="place"), 0.01)
     assert observed.outputs["w"] == "m/s"
     assert observed.sampling.sets == {"w_held_1": {"x": 1.0}}
 
