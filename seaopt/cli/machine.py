@@ -36,7 +36,7 @@ from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
-from seaopt.problem.stages import design_mpc, list_plants
+from seaopt.problem.stages import design_mpc, read_law
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
 from seaopt.reporting.sections.verdict import doubt_design
@@ -209,10 +209,7 @@ def _read_stage(session: Session, path: Path) -> Source:
     if problem.mpc is not None:
         stated = {name: content["mpc"]["spec"][name] for name in OF_A_STAGE}
         return design_mpc(replace(problem, mpc=replace(problem.mpc, **stated)), session.parameters())
-    if problem.schedule is not None:
-        robust_to = problem.robust_to(session.parameters())
-        return ScheduledController.from_dict(content, problem.design_plant, session.values(), robust_to)
-    return Controller.from_dict(content, list_plants(problem, session.parameters())[0], session.values())
+    return read_law(problem, session.parameters(), content)
 
 
 def _read_plan(session: Session, content: dict[str, Any]) -> ForceMPC | None:

@@ -10,15 +10,17 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from seaopt import __version__
 from seaopt.cli.progress import LABELS, LEAST_SHARE, show_progress
 from seaopt.cli.provenance import FILES, ROBUSTNESS, digest_fit_of, digest_sources
 from seaopt.cli.show import show_results, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
-from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController, read_law
+from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
+from seaopt.control import read_law as read_given_law
 from seaopt.control.frontier.rows import FRONTIER_SCHEMA
 from seaopt.control.laws.delay import DELAY_KEYS, settle_delays, warn_delays
 from seaopt.control.laws.stored import CONTROLLER_SCHEMA
@@ -45,7 +47,8 @@ from seaopt.problem.stages import (
     check_mpc_file,
     design_mpc,
     fit_problem,
-    list_plants,
+    read_law,
+    read_sweep,
     score_problem,
     simulate_experiment,
     sweep_problem,
@@ -61,6 +64,7 @@ from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
 from seaopt.testing.expectations import list_expectations
 
+T = TypeVar("T")
 SCHEMAS = {
     "fit": FIT_SCHEMA,
     "frf": "seaopt/frf/1",
@@ -213,24 +217,15 @@ class Session:
     def law(self) -> Controller | ScheduledController:
         """Return the law or schedule of this run or of the folder; refuse one for other limits than the problem's."""
         if "tune" not in self.results:
-            source, schedule = self.parameters(), self.problem.schedule
-            content = self._read("tune")
+            schedule, law = self.problem.schedule, read_law(self.problem, self.parameters(), self._read("tune"))
             if schedule is None:
-                law = Controller.from_dict(content, list_plants(self.problem, source)[0], self.values())
                 self._check_spec(law.spec)
-            else:
-                law = ScheduledController.from_dict(
-                    content,
-                    self.problem.design_plant,
-                    self.values(),
-                    self.problem.robust_to(source),
-                    self.problem.draws(source),
+            elif (law.over, list(law.points)) != (schedule.over, schedule.points):
+                raise ProblemError(
+                    f"{self._path('tune')}: is over other points than [controller.schedule] of {self.problem.source}; "
+                    f"run {self.spell('tune')} again"
                 )
-                if (law.over, list(law.points)) != (schedule.over, schedule.points):
-                    raise ProblemError(
-                        f"{self._path('tune')}: is over other points than [controller.schedule] of "
-                        f"{self.problem.source}; run {self.spell('tune')} again"
-                    )
+            else:
                 self._check_spec(replace(law.spec, bandwidth_hz=self._spec().bandwidth_hz))
             self.results["tune"] = law
         return self.results["tune"]
@@ -250,7 +245,7 @@ class Session:
             check_mpc_file(self.problem, self.plan(), path, f"run {self.spell('tune')}, and certify that")
             self._keep(linear_controller(self.plan()))
             return
-        given = read_law(path)
+        given = read_given_law(path)
         controller = assess_problem(self.problem, given, self.parameters())
         target, other = self.folder / FILES["tune"], "give the law another folder: -o DIR"
         if target.exists():
@@ -317,6 +312,14 @@ class Session:
             note = f"{path}: was tuned for another [robustness] than it is judged by; {again} to tune for this one"
             self._say_once("note", [note])
         return content
+
+    def _read_besides(self, stage: str, make: Callable[[dict[str, Any]], T]) -> T | None:
+        """Return a result that another stage can do without; None where there is none of this problem."""
+        try:
+            return make(self._read(stage)) if self._path(stage).exists() else None
+        except ProblemError as error:
+            self.say(f"left out: {error}")
+            return None
 
     def _simulate(self, tell: Progress) -> None:
         if not self.problem.table.experiment:
@@ -416,12 +419,7 @@ class Session:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; {WRITE_ONE}")
         experiments = self.experiments()
-        fitted = None
-        if (self.folder / FILES["fit"]).exists():
-            try:
-                fitted = Fit.from_dict(self._read("fit"))
-            except ProblemError as error:
-                self.say(f"left out: {error}")
+        fitted = self._read_besides("fit", Fit.from_dict)
         responses = estimate_responses(experiments, self.problem, fitted, self.stretch_s, tell)
         self.results["frf"] = responses
         self._write("frf", {"schema": SCHEMAS["frf"], **responses.to_dict()})
@@ -463,11 +461,11 @@ class Session:
         if self.problem.table.experiment:
             fitted = self.parameters()
             if isinstance(fitted, Fit):  # a design on measured points needs none
-                if not fitted.experiments:
-                    self.results["fit"] = fitted = replace(
-                        fitted, experiments=self.problem.choose_fitted(self.experiments())
-                    )
-                results.append(fitted)
+                used = fitted.experiments or self.problem.choose_fitted(self.experiments())
+                self.results["fit"] = replace(fitted, experiments=used)
+                results.append(self.results["fit"])
+        swept = self._read_besides("sweep", partial(read_sweep, self.problem, self.parameters()))
+        results += [] if swept is None else [swept]
         tuned = "tune" in self.results or self._path("tune").exists()
         if self.problem.spec is not None and (tuned or not results):  # a report is of something
             law = self.law()

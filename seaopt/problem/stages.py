@@ -30,6 +30,7 @@ from seaopt.control import (
 from seaopt.control.laws.delay import DELAY_KEYS, NEGLIGIBLE, LoopSpec, find_drive_delay, settle_delays
 from seaopt.control.loops.sampled_plant import list_names
 from seaopt.control.mpc.stored import check_described
+from seaopt.control.scheduling.scheduled_controller import restore_law
 from seaopt.errors import ControlError, ProblemError, SeaoptError
 from seaopt.estimation import Experiment, Fit, ModelledOutputs, fit
 from seaopt.estimation.result.findings import find_guesses, order_findings
@@ -331,6 +332,24 @@ def list_plants(
     responses = {name: response for name, response in measured.items() if name in problem.controller_table.robust_to}
     design = measured[problem.controller_table.plant] if problem.designs_on_response else problem.design_plant
     return design, {**plants, **responses}
+
+
+def read_law(
+    problem: Problem, source: Fit | ParameterSet, content: Mapping[str, Any]
+) -> Controller | ScheduledController:
+    """Return the law or schedule of a problem's controller.json; nothing is tuned. Raises FileError: it is damaged."""
+    return restore_law(content, *_list_arguments(problem, source))
+
+
+def read_sweep(problem: Problem, source: Fit | ParameterSet, content: Mapping[str, Any]) -> Frontier:
+    """Return the sweep of a problem's frontier.json, as `read_law` does."""
+    return Frontier.from_dict(content, *_list_arguments(problem, source))
+
+
+def _list_arguments(problem: Problem, source: Fit | ParameterSet) -> tuple[Any, ...]:
+    """Return what a law was tuned on, in the order of `from_dict`."""
+    design, _ = list_plants(problem, source)
+    return design, problem.values(source), problem.robust_to(source), problem.draws(source)
 
 
 def assess_problem(problem: Problem, given: GivenLaw, source: Fit | ParameterSet) -> Controller:

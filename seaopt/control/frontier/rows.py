@@ -10,7 +10,7 @@ from seaopt.control.frontier.free_law import FreeLaw
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.limits import MeasuredLoop
 from seaopt.control.loops.law import Law
-from seaopt.control.scheduling.scheduled_controller import Plants, ScheduledController
+from seaopt.control.scheduling.scheduled_controller import Plants, ScheduledController, restore_law
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.tuner import Draws, disturbance
 from seaopt.errors import FileError
@@ -75,7 +75,7 @@ class Frontier(Result, Worded):
     plot = PlotAccessor()
 
     rows: tuple[FrontierRow, ...]
-    controllers: tuple[Controller, ...] | tuple[ScheduledController, ...]
+    controllers: tuple[Controller | ScheduledController, ...]
     over: str | None = None  # the variable that the controllers are scheduled over
 
     @property
@@ -107,20 +107,14 @@ class Frontier(Result, Worded):
         draws: Draws = (),
     ) -> Frontier:
         """Return the sweep of a frontier.json; nothing is tuned. The arguments are those of the `from_dict` of its
-        controllers, of which `others` and `draws` are a schedule's. Raises FileError: a field is missing or malformed,
-        or contradicts another.
+        controllers, `others` and `draws` of schedules. Raises FileError: a field is missing or malformed, or
+        contradicts another.
         """
         read = read_fields(cls, content, FILE, remedy=SWEEP_AGAIN)
         tuned: list[Any] = content.get("controllers") or []
         if len(tuned) != len(read["rows"]):
             raise FileError(f"{FILE}: controllers has {len(tuned)} entries for {len(read['rows'])} rows; {SWEEP_AGAIN}")
-        if read["over"] is None:
-            controllers = tuple(Controller.from_dict(each, plant, params) for each in tuned)
-        elif isinstance(plant, Plant):
-            controllers = tuple(ScheduledController.from_dict(each, plant, params, others, draws) for each in tuned)
-        else:
-            raise FileError(f"{FILE}: over = {read['over']}: schedules are of a model; give the design plant")
-        frontier = cls(**read, controllers=controllers)
+        frontier = cls(**read, controllers=tuple(restore_law(each, plant, params, others, draws) for each in tuned))
         check_agrees(content, to_content(frontier), FILE, remedy=SWEEP_AGAIN)
         return frontier
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -29,8 +29,9 @@ from seaopt.control.scheduling.step_order import SHARE
 from seaopt.control.tuning.optimisation_problem import Task
 from seaopt.control.tuning.solution import feed_link
 from seaopt.control.tuning.tuner import Draws, RobustTo, describe_law, make_task
-from seaopt.errors import ControlError, suggestion
+from seaopt.errors import ControlError, require_type, suggestion
 from seaopt.formatting import format_count, join_words
+from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import Result, Worded, record
@@ -346,6 +347,20 @@ class ScheduledController(Result, Worded):
             for point, tuned in zip(table.points, contents, strict=True)
         )
         return cls.of_points(table, controllers, others, draws).with_places()
+
+
+def restore_law(
+    content: Mapping[str, Any],
+    plant: Plant | MeasuredResponse,
+    params: ParameterSet,
+    others: Plants | None = None,
+    draws: Draws = (),
+) -> Controller | ScheduledController:
+    """Return the law or the schedule of a controller.json, by `from_dict` of either."""
+    if content.get("schedule") is None:
+        return Controller.from_dict(content, plant, params)
+    require_type(plant, Plant, "plant", "give the model that the schedule was tuned on", ControlError)
+    return ScheduledController.from_dict(content, cast(Plant, plant), params, others, draws)
 
 
 @lru_cache(maxsize=8)

@@ -11,7 +11,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from seaopt.control import Controller, ForceMPC, Passivity, ScheduledController, Scorecard, scorecard
+from seaopt.control import Controller, ForceMPC, Frontier, Passivity, ScheduledController, Scorecard, scorecard
 from seaopt.control.deploy.export import export
 from seaopt.errors import FileError, SeaoptError, require_type
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
@@ -25,6 +25,7 @@ from seaopt.reporting.figures import certificate as certificates
 from seaopt.reporting.figures import fit as fits
 from seaopt.reporting.figures import loop as loops
 from seaopt.reporting.figures import simulation as simulations
+from seaopt.reporting.figures.frontier import frontier_panels
 from seaopt.reporting.figures.impedance import region_panel
 from seaopt.reporting.figures.log import log_panels
 from seaopt.reporting.figures.panel import Panel, compose_sheet
@@ -53,6 +54,7 @@ Result = (
     | StabilityMap
     | ScheduledController
     | LargeSignal
+    | Frontier
 )
 KINDS: dict[str, type[Any]] = {
     "fit": Fit,
@@ -63,12 +65,14 @@ KINDS: dict[str, type[Any]] = {
     "verification": Verification,
     "coupled": StabilityMap,
     "schedule": ScheduledController,
+    "frontier": Frontier,
 }
 PARTS = {
     "expectations": "What the problem file expects",
     "controller": "Controller",
     "schedule": "Schedule",
     "mpc": "Predictive control",
+    "frontier": "Bandwidths",
     "fit": "How well the model fits",
     "diagnostics": "Diagnostics",
     "ranking": "Which model",
@@ -81,7 +85,8 @@ PARTS = {
     "findings": "Findings",
     "provenance": "Provenance",
 }
-FILED = ("controller", "schedule", "fit", "ranking", "certificate", "amplitude", "contact")  # with figures as files
+# with figures as files
+FILED = ("controller", "schedule", "frontier", "fit", "ranking", "certificate", "amplitude", "contact")
 FIGURES_SCHEMA = "seaopt/figures/1"
 LAW_NAME = "force_law"  # of the C header that can be copied
 
@@ -98,6 +103,7 @@ class Material:
     verification: Verification | None = None
     coupled: StabilityMap | None = None
     schedule: ScheduledController | None = None
+    frontier: Frontier | None = None
     large: tuple[LargeSignal, ...] = ()
     passivity: Passivity | None = None
     diagnostics: Diagnostics | None = None
@@ -129,7 +135,7 @@ def write_report(
     Parameters
     ----------
     results : sequence of Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, LargeSignal
-        And ScheduledController. At most one of each, of LargeSignal any number; sections without a
+        And ScheduledController and Frontier. At most one of each, of LargeSignal any number; sections without a
         result are left out. A fit that was not read from a file has a section of diagnostics. A certificate's
         simulations need not be listed.
     path : path
@@ -245,6 +251,8 @@ def _list_plates(material: Material) -> Iterator[Plate]:
         yield Plate(name="loop", part="controller", heading="The loop on every plant" if plants else "", panels=panels)
     if material.schedule is not None:
         yield Plate(name="schedule", part="schedule", panels=schedule_panels(material.schedule, certificate))
+    if material.frontier is not None:
+        yield Plate(name="frontier", part="frontier", panels=frontier_panels(material.frontier))
     if fit is not None:
         yield from _list_plates_of_fit(fit, material.ranking, material.diagnostics)
     if material.ranking is not None:
@@ -356,6 +364,7 @@ def _render(
         controller,
         material.schedule,
         material.mpc,
+        material.frontier,
         fit,
         material.diagnostics,
         material.ranking,

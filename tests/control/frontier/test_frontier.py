@@ -139,6 +139,16 @@ def test_the_command_writes_table_json_and_figure(tmp_path, monkeypatch, capsys)
     assert [row["bandwidth_hz"] for row in content["rows"]] == [40, 60]
     assert [row["feasible"] for row in content["rows"]] == [True, False]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"frontier.json", "frontier.png", "frontier.svg"}
+    monkeypatch.setattr(sys, "argv", ["seaopt", "report", str(problem), "-o", str(tmp_path / "out")])
+    monkeypatch.setattr("seaopt.problem.stages.sweep", None)  # it is read
+    with pytest.raises(SystemExit) as end:
+        main()
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert not end.value.code and "Bandwidths" in page and (tmp_path / "out" / "figures" / "frontier.svg").exists()
+    problem.write_text(PROBLEM.replace("1.6", "1.7"))
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2 and "left out: " in (said := capsys.readouterr().err) and "frontier.json" in said
 
 
 @pytest.mark.parametrize("text", ["15", "15:60", "60:15:5", "15:60:0", "a:b:c", "1:2:1e-9", "nan:60:5"])

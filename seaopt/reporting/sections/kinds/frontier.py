@@ -41,6 +41,7 @@ def describe(frontier: Frontier) -> list[Section]:
     return [
         Section(
             title="Bandwidths",
+            part="frontier",
             tables=(Table(head=head, rows=rows, align="><>><>>>>>>", optional=("disturbance",)),),
             remarks=(
                 *(f"not met at {join_words(bands)} Hz: {text}" for text, bands in blocked.items()),
