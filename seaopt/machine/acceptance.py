@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field, replace
+from dataclasses import field, fields, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from seaopt.codec import to_content
+from seaopt.codec import Key, check_agrees, from_content, list_keys, read_fields, to_content
 from seaopt.control import Controller, ForceMPC, ScheduledController, draw, runnable
 from seaopt.control.deploy.target import hash_law
 from seaopt.control.laws.delay import find_drive
 from seaopt.control.loops.sampled_plant import conditions
 from seaopt.control.scheduling.scheduled_controller import place_variable
-from seaopt.errors import LogError, require_number, require_type
+from seaopt.errors import FileError, LogError, require_number, require_type
 from seaopt.estimation import Fit
 from seaopt.formatting import join_words
 from seaopt.logs import Log
@@ -30,7 +30,7 @@ from seaopt.machine.response.enclosed import enclose_outer, enclose_ticks
 from seaopt.machine.response.periods import Blocks, Played, cut_periods, join_blocks
 from seaopt.machine.response.reported import Reported, read_status
 from seaopt.machine.response.tripped import Trip, find_refused, find_trip
-from seaopt.machine.response.verdicts import Response, judge_response
+from seaopt.machine.response.verdicts import Motion, Response, judge_response
 from seaopt.machine.stepped import SAME_PLACE, Others, Source, stand, stands_still
 from seaopt.machine.ticks import FEWEST, Gaps, Ticks, find_reference, take_ticks
 from seaopt.machine.wording import say_position_stays
@@ -51,6 +51,34 @@ OTHER_LAW = "the logs are not of this law; mend that first, then record again"
 TRIPPED = "the gate tripped before the reference had repeated often enough; record all of it again"
 UNTOLD_LAW = "the logs do not tell whether they are of this law; record what would tell, as is said of each"
 ACCEPTANCE_SCHEMA = "seaopt/acceptance/1"
+FILE, ACCEPT_AGAIN = "acceptance.json", "judge its logs again"
+T = TypeVar("T")
+
+
+@record
+class LoggedReplay(Replay):
+    """The replay of a log, as acceptance.json has it."""
+
+    log: str
+    gaps: Gaps | None
+    status: Reported | None
+
+
+@record
+class Replays:
+    """The replays of all logs."""
+
+    met: bool
+    logs: tuple[LoggedReplay, ...]
+
+
+@record
+class Place:
+    """Where a schedule's variable stood."""
+
+    over: str
+    value: float
+    unit: str
 
 
 @record(eq=False, repr=False)
@@ -92,6 +120,14 @@ class Acceptance(Result, Worded):
         The requirements that a certificate says are not met.
     """
 
+    json_keys = (
+        *("met", "certificate"),
+        Key(field="broken", name="certificate_failed"),
+        Key(field="logs", name="replay"),
+        *("response", "enclosed", "differences", "left_out", "stepped"),
+        Key(field="stood", name="place"),
+    )
+
     controller: Controller
     sources: tuple[str, ...]
     replays: tuple[Replay, ...]
@@ -123,27 +159,60 @@ class Acceptance(Result, Worded):
         followed = all(row.position_stays is None for row in self.replays)
         return self.replayed and judged and certified and followed
 
+    @property
+    def logs(self) -> Replays:
+        """What acceptance.json has of each log."""
+        parts = zip(self.sources, self.replays, self.gaps, self.reported, strict=True)
+        names = [each.name for each in fields(Replay)]
+        rows = (
+            LoggedReplay(log=log, gaps=gaps, status=status, **{name: getattr(row, name) for name in names})
+            for log, row, gaps, status in parts
+        )
+        return Replays(met=self.replayed, logs=tuple(rows))
+
+    @property
+    def stood(self) -> Place | None:
+        """What acceptance.json has of the place."""
+        return self.place and Place(over=self.place[0], value=self.place[1], unit=self.place[2])
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of acceptance.json (schema seaopt/acceptance/1)."""
-        parts = zip(self.sources, self.replays, self.gaps, self.reported, strict=True)
-        logs = [
-            {"log": source} | to_content(row) | {"gaps": to_content(gaps), "status": to_content(reported)}
-            for source, row, gaps, reported in parts
-        ]
-        content = {
-            "schema": ACCEPTANCE_SCHEMA,
-            "met": self.met,
-            "certificate": self.certificate,
-            "certificate_failed": self.broken,
-            "replay": {"met": self.replayed, "logs": logs},
-            "response": None if self.response is None else self.response.to_dict(),
-            "enclosed": self.enclosed,
-            "differences": self.differences,
-            "left_out": self.left_out,
-            "stepped": self.stepped,
-            "place": None if self.place is None else dict(zip(("over", "value", "unit"), self.place, strict=True)),
-        }
-        return to_content(content)
+        return {"schema": ACCEPTANCE_SCHEMA} | to_content(self)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], controller: Source) -> Acceptance:
+        """Return the acceptance of an acceptance.json, without logs and measured responses; nothing is replayed.
+        `controller`: as of `accept`. Raises FileError: a field is missing or malformed, or contradicts another.
+        """
+        missing = [key.name for key in list_keys(cls) if key.name not in content]
+        if missing:
+            raise FileError(f"{FILE}: key {missing[0]} is missing; {ACCEPT_AGAIN}")
+        read = read_fields(cls, content, FILE, remedy=ACCEPT_AGAIN)
+        (logs,) = _read_part(content, "replay", Replays)
+        for place in _read_part(content, "place", Place):
+            read["place"] = place.over, place.value, place.unit
+        for motion in _read_part(content["response"] or {}, "friction", Motion):
+            read["response"] = replace(read["response"], effort=motion.effort, friction=motion.dry)
+        result = cls(
+            **read,
+            controller=stand(controller, None if read.get("place") is None else read["place"][1]),
+            sources=tuple(row.log for row in logs.logs),
+            replays=logs.logs,
+            gaps=tuple(row.gaps for row in logs.logs),
+            reported=tuple(row.status for row in logs.logs),
+        )
+        made = to_content(result)
+        (made["response"] or {}).pop("measured", None)
+        if content.get("fit_met") is False:  # then it is not met either
+            made["met"] = False
+        check_agrees(content, made, FILE, remedy=ACCEPT_AGAIN)
+        return result
+
+
+def _read_part(content: Mapping[str, Any], key: str, cls: type[T]) -> tuple[T, ...]:
+    """Return a part of acceptance.json; none where it is null."""
+    part = content.get(key)
+    return () if part is None else (from_content(cls, part, f"{FILE}: {key}", remedy=ACCEPT_AGAIN),)
 
 
 def accept(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from seaopt.codec import from_content
 from seaopt.machine.differences.comparison import TOLERATED, Comparison, Lines
 from seaopt.machine.differences.leeway import Leeway
 from seaopt.parameters import ParameterSet
@@ -41,6 +42,10 @@ class Difference:
     changes_high: float | None = None
     beside: tuple[Difference, ...] = ()  # what differs besides, of two that explain it together
     untold: bool = False  # the log does not tell it from the one that is named first
+
+    @classmethod
+    def _from_json(cls, content: dict[str, Any]) -> Difference:  # one may hold others
+        return from_content(cls, content, "a difference", remedy="correct that entry")
 
     @property
     def is_there(self) -> bool:

@@ -37,6 +37,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float
 
+from seaopt.codec import Key
 from seaopt.control import Controller
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import bound_disc
@@ -61,6 +62,15 @@ TRACKING = ("reference peak", "bandwidth")
 LONGEST = 600.0  # s: a record that is longer is not asked for
 
 
+@record
+class Motion:
+    """Whether dry friction, by the effort that it takes, lets the motor move under an effort that swings."""
+
+    dry: float
+    effort: float | None
+    moves: bool
+
+
 class AgainstFriction:
     """What has an effort that swings, and dry friction that it is to overcome; None where there is none."""
 
@@ -73,21 +83,32 @@ class AgainstFriction:
         return self.effort is not None and self.friction is not None and self.effort <= self.friction
 
     @property
-    def motion(self) -> dict[str, Any] | None:
-        """Content for JSON."""
+    def motion(self) -> Motion | None:
+        """What a file has of it."""
         if self.friction is None:
             return None
-        return {"dry": self.friction, "effort": self.effort, "moves": not self.still}
+        return Motion(dry=self.friction, effort=self.effort, moves=not self.still)
 
 
 @record(eq=False)
 class Response(AgainstFriction, Result):
     """The measured loop, and its limits."""
 
+    json_keys = (
+        *("met", "confidence"),
+        Key(field="judged", name="figures"),
+        *("at_amplitude_only", "needs_phases"),
+        Key(field="needs_lines", name="needs_lines_hz"),
+        Key(field="missing", name="missing_hz"),
+        *("rate", "period_s"),
+        Key(field="motion", name="friction"),
+        Key(field="lines", name="measured"),
+    )
+
     met: bool
     confidence: float
     judged: tuple[Judged, ...]
-    measured: tuple[Measured, ...]  # by amplitude
+    measured: tuple[Measured, ...] = ()  # by amplitude; not read back from a file
     at_amplitude_only: bool  # dry friction, and the gain is another one at another amplitude, or was seen at one only
     needs_phases: bool  # dry friction, and fewer than six sets of phases
     needs_lines: tuple[float, float] | None = None  # Hz, from where to where lines are to lie, where they do not
@@ -97,21 +118,10 @@ class Response(AgainstFriction, Result):
     rate: float = 1.0  # of the law, over what the clock of the logs says: Hz and seconds are those of the machine
     period_s: float = 0.0  # the longest of the references
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content for JSON."""
-        return {
-            "met": self.met,
-            "confidence": self.confidence,
-            "figures": self.judged,
-            "at_amplitude_only": self.at_amplitude_only,
-            "needs_phases": self.needs_phases,
-            "needs_lines_hz": self.needs_lines,
-            "missing_hz": self.missing,
-            "rate": self.rate,
-            "period_s": self.period_s,
-            "friction": self.motion,
-            "measured": [_describe_lines(part, 1.0 - self.confidence) for part in self.measured],
-        }
+    @property
+    def lines(self) -> tuple[dict[str, Any], ...]:
+        """What a file has of the measured responses."""
+        return tuple(_describe_lines(part, 1.0 - self.confidence) for part in self.measured)
 
 
 def _describe_lines(part: Measured, alpha: float) -> dict[str, Any]:
