@@ -124,6 +124,10 @@ def check_agrees(content: Any, made: Any, source: str, *, remedy: str, path: str
         return
     content, made = plain(content), plain(made)
     if not _agree(content, made, rtol):
+        if isinstance(content, list) and isinstance(made, list) and len(content) == len(made):
+            pairs = zip(content, made, strict=True)
+            for number, pair in enumerate(pairs if isinstance(made[0], Mapping) else (), start=1):  # which one differs
+                check_agrees(*pair, source, remedy=remedy, path=f"{path}.{number}", rtol=rtol)
         found, expected = shorten(content), shorten(made)
         raise FileError(f"{source}: {path} is {found}, and the other keys make {expected}; {remedy}")
 

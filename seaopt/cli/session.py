@@ -56,7 +56,7 @@ from seaopt.problem.stages import (
 )
 from seaopt.progress import Progress, count_off, divide
 from seaopt.reporting import write_frontier_figure, write_report
-from seaopt.reporting.responses import estimate_responses
+from seaopt.reporting.responses import FRF_SCHEMA, estimate_responses
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands, Step, Verdict
 from seaopt.reporting.sections.verdict import UNMET, doubt_design, judge_expectations, judge_joint, name_guesses
@@ -67,7 +67,7 @@ from seaopt.testing.expectations import list_expectations
 T = TypeVar("T")
 SCHEMAS = {
     "fit": FIT_SCHEMA,
-    "frf": "seaopt/frf/1",
+    "frf": FRF_SCHEMA,
     "tune": CONTROLLER_SCHEMA,
     "sweep": FRONTIER_SCHEMA,
     "certify": ROBUSTNESS_SCHEMA,

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from seaopt.codec import OrNaN
 from seaopt.errors import LogError
 from seaopt.frequency.response import ComplexLines, FrequencyResponse, Lines
 from seaopt.frequency.sampled import sampled_response
@@ -46,8 +47,8 @@ DELAYS = 41  # tried when the delay is unknown, half a sample apart
 class Uncertain:
     """A figure with its standard deviation."""
 
-    value: float
-    std: float
+    value: OrNaN
+    std: OrNaN
     unit: str
 
     def __str__(self) -> str:
@@ -102,7 +103,7 @@ class SecondOrder:
 
     json_keys = (
         *("K", "a", "b", "delay_s", "static_gain", "natural_frequency_hz", "damping_ratio"),
-        *("band_hz", "lines", "misfit"),
+        *("band_hz", "lines", "misfit", "values", "covariance", "clock", "unit"),
     )
 
     values: Float[np.ndarray, "4"]

@@ -27,7 +27,7 @@ from seaopt.frequency.second_order import (
     second_order,
 )
 from seaopt.logs import Log
-from seaopt.parameters import ParameterSet
+from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, SeriesSpring
 from seaopt.plants.friction import take_sliding
 from seaopt.plants.plant import evaluate
@@ -103,6 +103,63 @@ class Pair:
 
 
 @record(eq=False)
+class StoredPair:
+    """What frf.json has of a pair besides what is made of it."""
+
+    input: str
+    output: str
+    unit: str
+    averages: int
+    good_band_hz: tuple[float, float] | None
+    peak: Peak | None
+    second_order: SecondOrder | None
+    frequency_hz: Lines
+    real: Lines
+    imag: Lines
+    coherence: Lines
+
+    def make(self) -> Pair:
+        """Return the pair."""
+        estimate = FrequencyResponse(
+            frequency_hz=self.frequency_hz,
+            response=self.real + 1j * self.imag,
+            coherence=self.coherence,
+            averages=self.averages,
+        )
+        return Pair(
+            source=self.input,
+            output=self.output,
+            unit=self.unit,
+            estimate=estimate,
+            good_band_hz=self.good_band_hz,
+            peak=self.peak,
+            second_order=self.second_order,
+        )
+
+
+@record(eq=False)
+class StoredSurvey:
+    """What frf.json has of a survey besides what is made of it."""
+
+    clock: Clock
+    gain: Mapping[str, float]
+    own: Mapping[str, float]  # values of parameters of this log alone
+    pairs: tuple[StoredPair, ...]
+
+    def make(self, plant: Plant) -> Survey:
+        """Return the survey of a plant's log."""
+
+        def adapt(params: ParameterSet) -> ParameterSet:
+            own = {
+                name: Parameter(name=name, value=at, unit=plant.parameter_unit(name)) for name, at in self.own.items()
+            }
+            return params.with_parameters(*own.values())
+
+        pairs = tuple(pair.make() for pair in self.pairs)
+        return Survey(plant=plant, clock=self.clock, gain=self.gain, pairs=pairs, adapt=adapt)
+
+
+@record(eq=False)
 class Survey:
     """The pairs of one log.
 
@@ -163,9 +220,14 @@ class Survey:
 
     def to_dict(self, params: ParameterSet) -> dict[str, Any]:
         """Return one experiment's part of frf.json; `params` are the values that models are drawn with."""
+        adapted = self.adapt(params)
+        own = {name: each.value for name, each in adapted.items() if name not in params or each is not params[name]}
         return {
             "period_s": self.clock.period,
             "hold": self.clock.hold,
+            "clock": to_content(self.clock),
+            "gain": self.gain,
+            "own": own,
             "pairs": [_pair_dict(self, pair, params) for pair in self.pairs],
         }
 

@@ -7,15 +7,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from seaopt.errors import LogError
+from seaopt.codec import check_agrees, from_content
+from seaopt.errors import FileError, LogError
 from seaopt.estimation import Experiment, Fit
 from seaopt.frequency import Pair, SecondOrder, Survey
+from seaopt.frequency.survey import StoredSurvey
 from seaopt.parameters import ParameterSet
 from seaopt.problem import Problem
 from seaopt.progress import Progress, count_off
 from seaopt.records import record
 from seaopt.reporting.comparison import experiment_survey, view_sensors
 from seaopt.reporting.files import write_frequency_figure
+
+FRF_SCHEMA = "seaopt/frf/1"
+FILE, ESTIMATE_AGAIN = "frf.json", "estimate them again: seaopt frf"
+
+
+@record(eq=False)
+class StoredResponses:
+    """What frf.json has of each experiment."""
+
+    experiments: Mapping[str, StoredSurvey]
 
 
 @record(eq=False)
@@ -34,6 +46,32 @@ class Responses:
             for row, pair in zip(content[name]["pairs"], survey.pairs, strict=True):
                 row["fitted_misfit"] = self.fitted_misfit(name, pair)
         return {"experiments": content}
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], problem: Problem, fit: Fit | None = None) -> Responses:
+        """Return the responses of a frf.json; nothing is estimated. `problem`: whose logs they are of. `fit`: to lay
+        beside them. Raises FileError: a field is missing or malformed, or contradicts another.
+        """
+        stored = from_content(StoredResponses, content, FILE, remedy=ESTIMATE_AGAIN)
+        tables = {table.name: table for table in problem.table.experiment}
+        unknown = [name for name in stored.experiments if name not in tables]
+        if unknown:
+            raise FileError(f"{FILE}: {problem.source} has no experiment {unknown[0]}; {ESTIMATE_AGAIN}")
+        plants = {name: problem.plants[tables[name].plant] for name in stored.experiments}
+        surveys = {name: survey.make(plants[name]) for name, survey in stored.experiments.items()}
+        fitted: dict[str, tuple[Survey, Fit]] = {}
+        for name, survey in surveys.items():
+            if fit is not None and name in fit.nuisance:
+                at = fit.nuisance[name]
+                clock = replace(survey.clock, delay_s=at.delay_s, delay_free=False)
+                fitted[name] = replace(survey, clock=clock, gain=at.gain), fit
+        responses = cls(surveys=surveys, guess=problem.parameters, fitted=fitted)
+        made = responses.to_dict()
+        for name, each in made["experiments"].items():
+            for row, written in zip(each["pairs"], content["experiments"][name]["pairs"], strict=True):
+                row["fitted_misfit"] = written.get("fitted_misfit")  # of the fit that there was
+        check_agrees(content, made, FILE, remedy=ESTIMATE_AGAIN)
+        return responses
 
     def draw(self, path: Path) -> list[Path]:
         """Write the figure as SVG and PNG."""

@@ -8,6 +8,7 @@ import re
 import pytest
 
 import seaopt as so
+from seaopt.reporting.responses import Responses
 
 
 def test_run_leaves_everything(done):
@@ -287,6 +288,10 @@ def test_frf_shows_and_writes_what_the_logs_say_in_frequency(copied, seaopt):
     assert pair["fitted_misfit"] < pair["model_misfit"]
     assert pair["actuator"]["efficiency"]["value"] == pytest.approx(0.95, abs=0.01)
     assert len(pair["frequency_hz"]) == len(pair["coherence"]) == len(pair["real"]) == len(pair["imag"])
+    fit = so.Fit.from_dict(json.loads((copied / "all" / "fit.json").read_text(encoding="utf-8")))
+    read = Responses.from_dict(content, so.read_problem(copied / "short.toml"), fit)
+    misfit = read.fitted_misfit("chirp", read.surveys["chirp"].pairs[0])
+    assert misfit == pytest.approx(pair["fitted_misfit"], rel=1e-6)
 
 
 def test_frf_of_shorter_stretches_without_a_fit(folder, seaopt, stand_alone, without_drawing):
