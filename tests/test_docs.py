@@ -66,7 +66,7 @@ def check_own_plant(found):
 
 
 def check_on_the_target(found):
-    assert 0.8 < found["current_A"] <= 9.0
+    assert 0.8 < found["command"] <= 9.0
     assert found["currents_A"].shape == (100,)
 
 

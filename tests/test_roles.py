@@ -171,7 +171,7 @@ def test_the_scenarios_and_what_they_show_are_the_same(pair):
         (row.plant, row.scenario, row.passed) for row in second.rows
     ]
     for one, other in zip(first.rows, second.rows, strict=True):
-        for name in ("peak_force_N", "peak_current_A", "peak_angle_rad", "peak_energy_J", "final_error_N"):
+        for name in ("peak_force_N", "peak_command", "peak_angle_rad", "peak_energy_J", "final_error_N"):
             a, b = getattr(one, name), getattr(other, name)
             assert (a is None and b is None) or b == pytest.approx(a, rel=1e-5, abs=1e-9), (one.scenario, name)
 
@@ -196,7 +196,7 @@ def test_predictive_control_is_the_same(pair):
     np.testing.assert_allclose(laws[1].kalman.gain, laws[0].kalman.gain, rtol=1e-9)
     assert laws[1].kalman.units[laws[1].kalman.names.index("spring_deflection")] == "m"
     steps = [law.step(law.start, reference_N=2000.0, measurement_N=10.0) for law in laws]
-    assert steps[1].current_A == pytest.approx(steps[0].current_A, rel=1e-9)
+    assert steps[1].command == pytest.approx(steps[0].command, rel=1e-9)
     loops = [law.close(swing, params).figures() for law, (_, _, swing, params) in zip(laws, pair, strict=True)]
     assert loops[1].ms == pytest.approx(loops[0].ms, rel=1e-9)
 

@@ -120,7 +120,7 @@ def test_the_scenarios_are_the_same(paths, controllers):
     for key, other in played[1].items():
         one = played[0][key]
         assert one.passed == other.passed
-        for name in ("peak_force_N", "peak_current_A", "peak_energy_J", "final_error_N", "settling_s"):
+        for name in ("peak_force_N", "peak_command", "peak_energy_J", "final_error_N", "settling_s"):
             a, b = getattr(one, name), getattr(other, name)
             wanted = None if a is None else pytest.approx(a, rel=1e-4, abs=1e-6)
             assert b == wanted or key[0] != "stand", (key, name)
@@ -170,7 +170,7 @@ def test_predictive_control_is_the_same(paths):
     units = dict(zip(laws[1].kalman.names, laws[1].kalman.units, strict=True))
     assert (units["spring_deflection"], units["tau_s"], units["thetad_m"]) == ("rad", "N m", "rad/s")
     steps = [law.step(law.start, reference_N=5.0, measurement_N=0.1) for law in laws]
-    assert steps[1].current_A == pytest.approx(steps[0].current_A, rel=1e-6)
+    assert steps[1].command == pytest.approx(steps[0].command, rel=1e-6)
     check_words(repr(laws[1]).replace("ForceMPC", ""))
 
 
@@ -216,7 +216,7 @@ def test_a_raised_shank_rests_where_gravity_is_held(controllers, paths):
     rest = equilibrium(loop, [knee.complete(raised)])
     torque = 4.0 * 9.81 * 0.2 * np.sin(0.5)
     assert rest.force[0] == pytest.approx(torque, rel=1e-9)
-    assert rest.current_A[0] == pytest.approx(torque / (N * 0.7 * 0.0369), rel=1e-9)
+    assert rest.rest_command[0] == pytest.approx(torque / (N * 0.7 * 0.0369), rel=1e-9)
     check_words(repr(rest))
 
 

@@ -23,7 +23,7 @@ NOISE = np.random.default_rng(0).normal(size=(2, 900))
 LONG = so.Log.from_arrays(time=np.arange(900) / 100, I=NOISE[0], F1=NOISE[1])
 PLANT, THOR = so.plants.high_impedance(), so.plants.thor()
 
-GATE = {"range_N": (-1.0, 1.0), "max_step_N": 1.0, "max_held": 1, "ramp_A_per_s": 1.0}
+GATE = {"range_N": (-1.0, 1.0), "max_step_N": 1.0, "max_held": 1, "ramp_per_s": 1.0}
 SPEC = so.ControllerSpec(bandwidth_hz=30)
 STILL = so.Plant(
     name="still", states={}, inputs={"I": "A"}, outputs={"F1": "N"},
@@ -83,7 +83,7 @@ CASES = {
         for name, values in {
             "range_N": (5.0, None, "ab", (1.0,), ("a", "b"), (0.0, True)),
             "max_step_N": ("1", None, True),
-            "ramp_A_per_s": ("1", None, 1j),
+            "ramp_per_s": ("1", None, 1j),
             "max_held": (2.5, 2.0, float("nan"), float("inf"), "2", None, True),
         }.items()
         for value in values
@@ -118,7 +118,7 @@ CASES = {
         f"reset at {name} = 'x'": lambda name=name: runnable(tuned(), gate=PlausibilityGate(**GATE)).reset(
             **{name: "x"}
         )
-        for name in ("reference", "measurement", "current_A")
+        for name in ("reference", "measurement", "command")
     },
     "swept plant": lambda: so.control.sweep(None, THOR, SPEC, [20.0]),
     "swept spec": lambda: so.control.sweep(PLANT, THOR, None, [20.0]),

@@ -178,7 +178,7 @@ def choose_gate(
         range_N=(low, high),
         max_step_N=step,
         max_held=spec.max_held,
-        ramp_A_per_s=limit / spec.ramp_s,
+        ramp_per_s=limit / spec.ramp_s,
         agreement=agreement and from_content(Agreement, agreement, source, remedy="tune again"),
     )
 

@@ -496,7 +496,8 @@ class Session:
     def _read_certificate(self) -> None:
         """Take the folder's certificate."""
         problem, content, law = self.problem, self._read("certify"), self.law()
-        options: dict[str, Any] = {"ranges": problem.ranges, "others": problem.parameters}
+        plan = None if problem.mpc is None else self.plan()
+        options: dict[str, Any] = {"ranges": problem.ranges, "others": problem.parameters, "plan": plan}
         self.results["certify"] = Certificate.from_dict(
             content, law, problem.certified_plants(), self.parameters(), **options
         )

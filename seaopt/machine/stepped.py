@@ -143,12 +143,12 @@ def _run_plan(
     for k, readings in enumerate(rows[:, [names.index(name) for name in law.reads]].tolist()):
         before = state.kalman
         result = law.step(state, ticks.reference[k : k + ahead], float(ticks.measured[k, 0]), readings)
-        out[k], state = result.current_A, result.state
+        out[k], state = result.command, result.state
         if follow:
             line = np.vstack([before.past, np.zeros(before.past.shape[1])])
             line[-1, 0] = ticks.command[k] - result.state.terms[1] * law.per_effort
             kalman = law.kalman.go_on(line, state.kalman.corrected, state.kalman.innovation)
-            state = replace(state, current_A=float(ticks.command[k]), kalman=kalman)
+            state = replace(state, command=float(ticks.command[k]), kalman=kalman)
     return out, state
 
 
@@ -171,7 +171,7 @@ def list_starts(setting: Setting) -> Iterator[tuple[State, int]]:
     try:
         yield (
             law.reset(
-                float(ticks.reference[0]), measured, current_A=command, readings=ticks.further[0].tolist(), **placed
+                float(ticks.reference[0]), measured, command=command, readings=ticks.further[0].tolist(), **placed
             ),
             0,
         )

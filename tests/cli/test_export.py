@@ -66,7 +66,7 @@ def test_a_law_that_is_not_the_certified_one_is_warned_of(done, seaopt, tmp_path
 
 @pytest.mark.parametrize(("largest", "typed"), [(300.0, []), (200.0, ["the gate"])])
 def test_a_gate_that_is_typed_as_the_file_has_it_is_the_certified_one(largest, typed):
-    gate = PlausibilityGate(range_N=(-4e3, 4e3), max_step_N=300.0, max_held=5, ramp_A_per_s=90.0)
+    gate = PlausibilityGate(range_N=(-4e3, 4e3), max_step_N=300.0, max_held=5, ramp_per_s=90.0)
     content = {"guards": {"gate": to_content(gate), "derate": False}}
     options = {"gate": replace(gate, max_step_N=largest), "derate": None, "tracking_time_s": None}
     assert _list_typed(content, options) == typed
@@ -74,7 +74,7 @@ def test_a_gate_that_is_typed_as_the_file_has_it_is_the_certified_one(largest, t
 
 def test_a_gate_that_is_left_out_of_predictive_control_is_not_the_certified_one():
     plant = so.plants.rotary(link="locked")
-    gate = PlausibilityGate(range_N=(-300.0, 300.0), max_step_N=60.0, max_held=4, ramp_A_per_s=300.0)
+    gate = PlausibilityGate(range_N=(-300.0, 300.0), max_step_N=60.0, max_held=4, ramp_per_s=300.0)
     spec = MPCSpec(current_limit_A=3.0, measured="tau_s", bandwidth_hz=10.0, max_sensitivity=2.0)
     for made, differs in ((gate, ["the gate"]), (None, [])):
         content = {"mpc": describe_mpc(force_mpc(plant, plant.defaults, spec, gate=made)), "sample_time_s": 1e-3}

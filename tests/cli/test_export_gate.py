@@ -97,7 +97,7 @@ def test_a_gate_that_is_typed_is_in_the_exported_code(tuned, folder, compiler, s
     out, code = tuned(PROBLEM, *typed)
     assert out.returncode == 1 and "not certified" in out.stdout, out.stderr
     problem = so.read_problem(folder / "gated.toml")
-    gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=3, ramp_A_per_s=180.0)
+    gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=3, ramp_per_s=180.0)
     law = runnable(tune_problem(problem, problem.parameters), gate=gate)
     assert "fault" in compare(LoadedLaw(compiler, code, "force_law", 2, gated=True), law)
     for option in ((), ("--no-gate",)):
@@ -162,11 +162,11 @@ def test_an_edited_gate_is_refused(tuned, folder):
 
 
 def test_a_plans_own_step_is_that_of_its_code(stand, thor):
-    gate = PlausibilityGate(range_N=(-3000.0, 3500.0), max_step_N=300.0, max_held=8, ramp_A_per_s=45.0)
+    gate = PlausibilityGate(range_N=(-3000.0, 3500.0), max_step_N=300.0, max_held=8, ramp_per_s=45.0)
     plans = [force_mpc(stand, thor, MPCSpec(current_limit_A=9.0), gate=one) for one in (gate, None)]
     gated, bare = ({"mpc": {"code": collect_code(plan).to_dict()}, "guards": {"gate": None}} for plan in plans)
     chosen = choose_gate(gated, {"range_N": "-100:200", "ramp_s": 0.2}, {})
-    assert chosen == PlausibilityGate(range_N=(-100.0, 200.0), max_step_N=300.0, max_held=5, ramp_A_per_s=45.0)
+    assert chosen == PlausibilityGate(range_N=(-100.0, 200.0), max_step_N=300.0, max_held=5, ramp_per_s=45.0)
     with pytest.raises(ProblemError, match=r"type --gate-max-step, or write \[controller.gate\]"):
         choose_gate(bare, {"range_N": "-100:200"}, {})
 
@@ -184,7 +184,7 @@ def test_predictive_control_takes_both(tuned, folder, compiler, seaopt):
     bare = force_mpc(*mpc.design, mpc.spec)
     typed = ("--gate", "-4000:4000", "--gate-max-step", "300", "--gate-max-held", "3")
     assert seaopt("export", "out", "--c", "typed", *typed).returncode == 1
-    gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=3, ramp_A_per_s=90.0)
+    gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=3, ramp_per_s=90.0)
     compare_plans(LoadedMPC(compiler, folder / "typed"), force_mpc(*bare.design, bare.spec, gate=gate))
     assert seaopt("export", "out", "--c", "ranged", "--gate", "-100:200").returncode == 1  # with the problem's step
     assert f"mpc_step = (force_mpc_real){mpc.gate.max_step_N:.17g};" in (
@@ -200,6 +200,6 @@ def compare_plans(compiled, mpc):
     for row, reading in zip(rows, readings(), strict=False):
         result = mpc.step(state, 500.0, float(reading))
         state = result.state
-        assert row[0] == pytest.approx(result.current_A, abs=1e-7)
+        assert row[0] == pytest.approx(result.command, abs=1e-7)
         said.append(state.gate.status)
     assert [STATUS[int(value)] for value in rows[:, 4]] == said and "fault" in said

@@ -291,14 +291,14 @@ def test_older_predictive_control_is_named_where_it_is_at_its_limits(planned, co
 @pytest.mark.slow
 def test_a_gate_of_predictive_control_that_tripped_is_named(planned):
     """Its sensor fails in a row, and stays."""
-    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_A_per_s=50.0)
+    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_per_s=50.0)
     gated, first = replace(planned.controller, gate=gate), 2500
     log = planned.log(Machine(), SHORT)
     force = np.where(np.arange(len(log)) < first, log["F1"], 9000.0)
     state, current = gated.start, np.empty(len(log))
     for k, (goal, read) in enumerate(zip(log["reference"].tolist(), force.tolist(), strict=True)):
         step = gated.step(state, goal, read)
-        current[k], state = step.current_A, step.state
+        current[k], state = step.command, step.state
     assert np.allclose(current[:first], log["I"][:first], atol=1e-6) and np.all(current[first + 500 :] == 0.0)
     taken = so.Log.from_arrays(time=log.time, source="bench", reference=log["reference"], F1=force, I=current)
     result = so.accept(gated, [taken])

@@ -43,7 +43,7 @@ def test_periods_at_the_limit_are_counted_and_said(controller, bench, tmp_path):
 
 
 def test_periods_in_which_the_gate_did_not_believe_a_reading_are_counted(compiler, controller, tmp_path):
-    gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=12.5, max_held=20, ramp_A_per_s=50.0)
+    gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=12.5, max_held=20, ramp_per_s=50.0)
     gated = replace(controller, gate=gate)
     log = Bench(compiler, tmp_path, gated, "gated").log(
         Machine(), REFERENCE * np.minimum(np.arange(REFERENCE.size) / PERIOD, 1.0)
@@ -67,7 +67,7 @@ def test_periods_in_which_the_gate_did_not_believe_a_reading_are_counted(compile
 
 def test_a_gate_that_was_left_out_is_named(controller, bench):
     """The C without a gate, of readings that the gate of the law would not have believed."""
-    gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=12.5, max_held=20, ramp_A_per_s=50.0)
+    gate = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=12.5, max_held=20, ramp_per_s=50.0)
     log = bench.log(Machine(), multisine(PERIOD, LINES, 10, 60.0, 3, bias=300.0), noise=6.0)
     (row,) = so.accept(replace(controller, gate=gate), [log]).replays
     first = row.causes[0]
@@ -78,7 +78,7 @@ def trip(compiler, controller, folder, first, reading=9000.0):
     """Return a law with a gate, and the log of its C in which the sensor fails in a row: readings that stay at a value,
     and what the law steps make of them.
     """
-    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_A_per_s=50.0)
+    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_per_s=50.0)
     gated = replace(controller, gate=gate)
     log = Bench(compiler, folder, gated, "gated").log(Machine(), REFERENCE)
     force, law = np.where(np.arange(len(log)) < first, log["F1"], reading), runnable(gated, gate=gate)

@@ -93,7 +93,7 @@ def test_a_command_that_was_stopped_is_no_open_loop(controller, bench, fades):
 
 
 def test_a_gate_of_the_firmware_that_tripped_is_a_stop(compiler, tmp_path, controller):
-    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_A_per_s=50.0)
+    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_per_s=50.0)
     bench = Bench(compiler, tmp_path, replace(controller, gate=gate))
     reference = 0.3 * REFERENCE
     reference[3000:] += 3000.0  # the force goes beyond the range

@@ -310,7 +310,7 @@ def _describe(stored: Controller, law: RunnableLaw | RunnableSchedule) -> dict[s
 def _write_gate(gate: PlausibilityGate, sample_time_s: float, number: Writer) -> dict[str, Any]:
     """Return a gate's numbers, exact for the code and rounded for what is read."""
     (low, high), agreement = gate.range_N, gate.agreement
-    exact = {"low": low, "high": high, "step": gate.max_step_N, "ramp": gate.ramp_A_per_s * sample_time_s}
+    exact = {"low": low, "high": high, "step": gate.max_step_N, "ramp": gate.ramp_per_s * sample_time_s}
     encoders: list[dict[str, str]] = []
     if agreement is not None:
         exact |= {"apart": agreement.limit, "share": agreement.share, "percent": 100.0 * agreement.share}

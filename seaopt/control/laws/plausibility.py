@@ -5,7 +5,7 @@ moves in the time since: with h readings refused in between, `max_step_N` (h + 1
 moved is believed again as soon as it can have got there. The first reading is judged by its jump from the measurement
 that the law was reset with; where none was given, as in predictive control, it is judged by its range alone. Up to
 `max_held` readings in a row that are not plausible are replaced by the last that was. One more is a fault: from then on
-the law stands still, the command goes to zero at `ramp_A_per_s`, and stays there until the law is reset, for a sensor
+the law stands still, the command goes to zero at `ramp_per_s`, and stays there until the law is reset, for a sensor
 that comes back is not one to trust.
 
 The most that a sampled plant can move between two samples while the effort stays within :math:`\pm F` is
@@ -284,7 +284,7 @@ class PlausibilityGate:
         Largest change from one sample to the next.
     max_held : int
         Readings in a row that are bridged.
-    ramp_A_per_s : float
+    ramp_per_s : float
         How fast the command goes to zero at a fault.
     agreement : Agreement, optional
         With which encoders a reading must agree.
@@ -296,7 +296,7 @@ class PlausibilityGate:
 
     Examples
     --------
-    >>> gate = PlausibilityGate(range_N=(-2000, 2000), max_step_N=100, max_held=2, ramp_A_per_s=50)
+    >>> gate = PlausibilityGate(range_N=(-2000, 2000), max_step_N=100, max_held=2, ramp_per_s=50)
     >>> state = GateState(measurement=10.0)
     >>> for reading in (20.0, 1e4, float("nan"), float("nan")):
     ...     used, state = gate.screen(state, reading)
@@ -310,7 +310,7 @@ class PlausibilityGate:
     range_N: tuple[float, float]
     max_step_N: float
     max_held: int
-    ramp_A_per_s: float
+    ramp_per_s: float
     agreement: Agreement | None = None
 
     def __post_init__(self) -> None:
@@ -320,7 +320,7 @@ class PlausibilityGate:
         low, high = (require_number(end, "range_N", ControlError) for end in ends)
         if not -LARGEST < low < high < LARGEST:
             raise ControlError(f"range_N = ({low:g}, {high:g}) is not a range; give finite low < high")
-        for name in ("max_step_N", "ramp_A_per_s"):
+        for name in ("max_step_N", "ramp_per_s"):
             value = require_number(getattr(self, name), name, ControlError)
             if not 1.0 / LARGEST < value < LARGEST:  # which a target's `float` holds, too
                 raise ControlError(
@@ -359,10 +359,10 @@ class PlausibilityGate:
         refused = state.held + 1
         return state.measurement, replace(state, held=refused, fault=refused > self.max_held, disagrees=near)
 
-    def ramp(self, current_A: float, sample_time_s: float) -> float:
+    def ramp(self, command: float, sample_time_s: float) -> float:
         """Return the command a sample later, at a fault."""
-        step = self.ramp_A_per_s * sample_time_s
-        return math.copysign(max(abs(current_A) - step, 0.0), current_A)
+        step = self.ramp_per_s * sample_time_s
+        return math.copysign(max(abs(command) - step, 0.0), command)
 
     @classmethod
     def of_controller(
@@ -392,7 +392,7 @@ class PlausibilityGate:
         >>> spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
         >>> controller = so.tune(so.plants.high_impedance(), so.plants.thor(), spec)
         >>> gate = PlausibilityGate.of_controller(controller, range_N=(-4000.0, 4000.0))
-        >>> print(f"{gate.max_step_N:.0f} N, {gate.ramp_A_per_s:.0f} A/s")
+        >>> print(f"{gate.max_step_N:.0f} N, {gate.ramp_per_s:.0f} A/s")
         473 N, 90 A/s
         """
         if not hasattr(controller, "command_limit"):
@@ -419,7 +419,7 @@ class PlausibilityGate:
             range_N=spec.range_N,
             max_step_N=largest,
             max_held=spec.max_held,
-            ramp_A_per_s=limit / spec.ramp_s,
+            ramp_per_s=limit / spec.ramp_s,
             agreement=agreement,
         )
 

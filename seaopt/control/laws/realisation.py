@@ -66,7 +66,7 @@ class LawState:
     ----------
     x : array, shape (n,)
         State.
-    current_A : float
+    command : float
         The last command, in its unit.
     held : int
         Samples in a row that were not used because a number in them was not finite, or beyond 1e15.
@@ -81,7 +81,7 @@ class LawState:
     """
 
     x: Vector
-    current_A: float = 0.0
+    command: float = 0.0
     held: int = 0
     gate: GateState = GateState()
     heat: tuple[float, float] = COLD
@@ -128,7 +128,7 @@ class Guarded:
         self,
         reference: float,
         measurement: Reading | None,
-        current_A: float,
+        command: float,
         readings: Sequence[float],
         numbers: Sequence[float] | None = None,
     ) -> tuple[float, Reading, float, GateState]:
@@ -136,18 +136,18 @@ class Guarded:
         Raises ControlError: an input is not finite or beyond 1e15, the measurement is outside the gate's range, or the
         current is above the limit.
         """
-        for name, value in (("reference", reference), ("current_A", current_A)):
+        for name, value in (("reference", reference), ("command", command)):
             require_number(value, name, ControlError)
         is_stated, measurement = measurement is not None, self._check_measurement(measurement)
         seen = self.gate.start(float(np.ravel(measurement)[0])) if self.gate is not None and is_stated else GateState()
-        if not all(map(is_number, (reference, current_A, *np.ravel(measurement), *readings))):
+        if not all(map(is_number, (reference, command, *np.ravel(measurement), *readings))):
             raise ControlError(
-                f"reference = {reference:g}, measurement = {measurement}, current_A = {current_A:g}, readings = "
+                f"reference = {reference:g}, measurement = {measurement}, command = {command:g}, readings = "
                 f"{list(readings)}: give finite numbers, within +-{LARGEST:g}"
             )
-        if not abs(current_A) <= self.command_limit:
+        if not abs(command) <= self.command_limit:
             limit = show_command(self.command_limit, *self.command)
-            raise ControlError(f"current_A = {current_A:g} is above the limit of {limit}; lower it")
+            raise ControlError(f"command = {command:g} is above the limit of {limit}; lower it")
         added = 0.0
         if self.outer is not None:
             (position,) = self._take(readings, self.outer.position) if readings else (0.0,)
@@ -156,7 +156,7 @@ class Guarded:
         if self.compensation is not None:
             reads = self._take_terms(readings) or (0.0,) * len(self.compensation.reads)
             reference, added, _ = self.compensation.step(FORGOTTEN, reference, reads, numbers)
-        return reference, measurement, current_A / self.per_effort - added, seen
+        return reference, measurement, command / self.per_effort - added, seen
 
     def _take_terms(self, readings: Sequence[float]) -> tuple[float, ...]:
         """Return the readings of the terms, of all."""
@@ -216,7 +216,7 @@ class Guarded:
         limit = min(self.command_limit, self.heat.limit(state.heat))
         current, following = self._decide(state, reference, measurement, readings, limit, advance, numbers, noted)
         current = min(max(current, -limit), limit)  # one that is held or taken to zero, too
-        return current, replace(following, current_A=current, heat=self.heat.warm(state.heat, current))
+        return current, replace(following, command=current, heat=self.heat.warm(state.heat, current))
 
     def _decide(
         self,
@@ -224,7 +224,7 @@ class Guarded:
         reference: float,
         measurement: Reading,
         readings: Sequence[float],
-        limit_A: float,
+        limit: float,
         advance: Advance,
         numbers: Sequence[float] | None,
         noted: Mapping[str, Any],
@@ -236,20 +236,20 @@ class Guarded:
             regulated, seen = self.gate.screen(seen, float(np.ravel(measurement)[0]), encoders)
             measurement = regulated if self.measured == 1 else np.array([regulated, *np.ravel(measurement)[1:]])
             if seen.fault:
-                current = self.gate.ramp(state.current_A, self.sample_time_s)
-                return current, replace(state, current_A=current, gate=seen, **noted)
+                current = self.gate.ramp(state.command, self.sample_time_s)
+                return current, replace(state, command=current, gate=seen, **noted)
         readings = self._take_terms(readings)
         taken = all(map(is_number, (reference, *np.ravel(measurement), *readings)))
         added, memory = 0.0, state.memory
         with np.errstate(all="ignore"):
             if self.compensation is not None:
                 reference, added, memory = self.compensation.step(state.memory, reference, readings, numbers)
-            force, applied, x = advance(reference, measurement, added, limit_A / self.per_effort)
+            force, applied, x = advance(reference, measurement, added, limit / self.per_effort)
         if not (taken and math.isfinite(force) and np.isfinite(x).all()):
-            return state.current_A, replace(state, held=state.held + 1, gate=seen, **noted)
+            return state.command, replace(state, held=state.held + 1, gate=seen, **noted)
         current = applied * self.per_effort
-        current = min(max(current, -limit_A), limit_A)  # a limit to the last bit
-        return current, replace(state, x=x, current_A=current, held=0, gate=seen, memory=memory, **noted)
+        current = min(max(current, -limit), limit)  # a limit to the last bit
+        return current, replace(state, x=x, command=current, held=0, gate=seen, memory=memory, **noted)
 
 
 @record(eq=False)
@@ -307,7 +307,7 @@ class RunnableLaw(Guarded):
         self,
         reference: float = 0.0,
         measurement: Reading | None = None,
-        current_A: float = 0.0,
+        command: float = 0.0,
         heat: tuple[float, float] = COLD,
         readings: Sequence[float] = (),
     ) -> LawState:
@@ -319,12 +319,12 @@ class RunnableLaw(Guarded):
         `further`; zero if left out. Raises ControlError: an input is not finite or beyond 1e15, the measurement is
         outside the gate's range, or the current is above the limit.
         """
-        reference, measurement, effort, seen = self.begin(reference, measurement, current_A, readings)
+        reference, measurement, effort, seen = self.begin(reference, measurement, command, readings)
         per_reference, per_measurement = self.find_rest()
         x = per_reference * reference - np.dot(per_measurement, measurement)
         if self.integrators:
             x[0] = effort - self._find_force(x, reference, measurement)
-        return LawState(x=x, current_A=current_A, gate=seen, heat=heat)
+        return LawState(x=x, command=command, gate=seen, heat=heat)
 
     def _find_force(self, x: Vector, reference: float, measurement: Reading) -> float:
         """Return the effort, not limited."""

@@ -94,12 +94,16 @@ def export_mpc(mpc: ForceMPC, folder: Path | str, *, single_precision: bool = Fa
 def write_code(code: MPCCode, folder: Path | str, *, single_precision: bool = False, uncertified: str = "") -> Path:
     """Write a controller's C code, as `export_mpc`. `uncertified`: why it is not certified, for a comment."""
     target = Path(folder)
-    for name in SOURCES:
-        write_text(target / name, resources.files("seaopt.control.mpc").joinpath("c", name).read_text(encoding="utf-8"))
-    write_text(target / "force_mpc_data.h", _format_data(code, single_precision, uncertified))
-    for name, part in code.parts.items():
-        write_text(target / name, part)
+    for name, text in list_sources(code, single_precision=single_precision, uncertified=uncertified).items():
+        write_text(target / name, text)
     return target
+
+
+def list_sources(code: MPCCode, *, single_precision: bool = False, uncertified: str = "") -> dict[str, str]:
+    """Return the files of a controller's C code by name."""
+    folder = resources.files("seaopt.control.mpc").joinpath("c")
+    texts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in SOURCES}
+    return {**texts, "force_mpc_data.h": _format_data(code, single_precision, uncertified), **code.parts}
 
 
 def collect_code(mpc: ForceMPC) -> MPCCode:
@@ -114,7 +118,7 @@ def collect_code(mpc: ForceMPC) -> MPCCode:
         "PREFILTER": 0 if spec.low_pass is None else spec.low_pass.den.size - 1,
     }  # fmt: skip
     numbers = {
-        "limit": mpc.command_limit, "slew": spec.slew_per_sample_A, "static_gain": mpc.static_gain,
+        "limit": mpc.command_limit, "slew": spec.slew_per_sample, "static_gain": mpc.static_gain,
         "offset": float(kalman.offset[0]), "violation": VIOLATION, "penalty": PENALTY, "wide": WIDE,
         "slack_unit": SLACK_UNIT, "lag": prediction.lag_s / spec.sample_time_s,
     }  # fmt: skip
@@ -164,7 +168,7 @@ def set_gate(code: MPCCode, gate: PlausibilityGate | None, sample_time_s: float)
     numbers = {name: value for name, value in code.numbers.items() if name not in ("low", "high", "step", "ramp")}
     if gate is not None:
         (numbers["low"], numbers["high"]), numbers["step"] = gate.range_N, gate.max_step_N
-        numbers["ramp"] = gate.ramp_A_per_s * sample_time_s
+        numbers["ramp"] = gate.ramp_per_s * sample_time_s
     return replace(code, sizes=sizes, numbers=numbers)
 
 

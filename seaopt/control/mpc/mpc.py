@@ -289,7 +289,7 @@ class ForceMPC(ReadsLink, Result, Worded):
         n, m = self.prediction.knots.size, len(self.prediction.rows)
         return MPCState(
             kalman=self.kalman.start,
-            current_A=0.0,
+            command=0.0,
             plan=np.zeros(n),
             sides=np.zeros(m, dtype=int),
             age=self.spec.samples,
@@ -324,7 +324,7 @@ class ForceMPC(ReadsLink, Result, Worded):
         references = references + terms[0]
         if self.spec.low_pass is not None:
             references, shaped = shape_references(self.spec.low_pass, shaped, references)
-        limit, last, seen = self.command_limit, state.current_A, state.gate
+        limit, last, seen = self.command_limit, state.command, state.gate
         most = limit if self.heat is None else min(limit, self.heat.limit(state.heat))
         if self.gate is not None:
             _, seen = self.gate.screen(seen, measurement_N)
@@ -338,7 +338,7 @@ class ForceMPC(ReadsLink, Result, Worded):
         xi = ahead[: self.rest_state.size] - self.rest_state * (u_s + drift)
         q, low, high = self.program(xi, u_s, before, drift, targets, most)
         shifted = self.shift @ state.plan
-        taken = self.prediction.take(added / limit, (added - last + before) / self.spec.slew_per_sample_A)
+        taken = self.prediction.take(added / limit, (added - last + before) / self.spec.slew_per_sample)
         low, high = low - taken, high - taken
         solution = self.solver.solve(q, low, high, state.sides, self.spec.max_iterations)
         theta, status = solution.x, self._fault(solution, low, high)
@@ -354,9 +354,9 @@ class ForceMPC(ReadsLink, Result, Worded):
         current = self.admissible(float(planned[0]) + added, last, most)
         heat = state.heat if self.heat is None else self.heat.warm(state.heat, current)
         kalman = self._command(state.kalman, corrected, innovation, current - added)
-        after = replace(state, kalman=kalman, current_A=current, plan=planned, sides=sides, age=age)
+        after = replace(state, kalman=kalman, command=current, plan=planned, sides=sides, age=age)
         return MPCStep(
-            current_A=current,
+            command=current,
             solved=not status,
             status=status or solution.status,
             target_N=float(targets[-1]),
@@ -372,33 +372,33 @@ class ForceMPC(ReadsLink, Result, Worded):
     ) -> tuple[float, MPCState]:
         """Return the current and the next state alone, as `close_loop` takes them."""
         result = self.step(state, reference_N, measurement_N, readings)
-        return result.current_A, result.state
+        return result.command, result.state
 
-    def admissible(self, current_A: float, last_A: float, most_A: float) -> float:
+    def admissible(self, command: float, last: float, most: float) -> float:
         """Return the current nearest to one given that slew and size allow after the last."""
-        slew = self.spec.slew_per_sample_A
-        return float(np.clip(np.clip(current_A, last_A - slew, last_A + slew), -most_A, most_A))
+        slew = self.spec.slew_per_sample
+        return float(np.clip(np.clip(command, last - slew, last + slew), -most, most))
 
     def program(
-        self, xi: Float[np.ndarray, " nx"], u_s: float, last_A: float, drift: float, targets: References, most_A: float
+        self, xi: Float[np.ndarray, " nx"], u_s: float, last: float, drift: float, targets: References, most: float
     ) -> tuple[Float[np.ndarray, " nv"], PerRow, PerRow]:
         """Return the vectors of the quadratic program: its gradient, lower and upper bounds of its rows.
 
-        `xi`: the state's distance from its target. `u_s`, `last_A`, `drift`: the command at rest, the last one, and the
+        `xi`: the state's distance from its target. `u_s`, `last`, `drift`: the command at rest, the last one, and the
         estimate of its disturbance. `targets`: the force's, from the first sample that a command reaches on, as far as
-        they are known. `most_A`: the limit of the command at this sample.
+        they are known. `most`: the limit of the command at this sample.
         """
         prediction, limit, ones = self.prediction, self.command_limit, np.ones(self.prediction.knots.size)
         slopes = np.zeros(len(prediction.M))
         if slopes.size:
-            slopes[0] = (last_A - u_s) / self.spec.slew_per_sample_A
+            slopes[0] = (last - u_s) / self.spec.slew_per_sample
         lag = prediction.lag_s / self.spec.sample_time_s
         delta = targets[:-1] - targets[-1] + lag * np.diff(targets)
-        gradient = prediction.F @ np.append(xi, last_A - u_s) + prediction.R @ delta
-        under, over = prediction.outputs.limits(np.append(xi, last_A - u_s), u_s + drift, WIDE)
+        gradient = prediction.F @ np.append(xi, last - u_s) + prediction.R @ delta
+        under, over = prediction.outputs.limits(np.append(xi, last - u_s), u_s + drift, WIDE)
         q = np.concatenate([gradient, np.full(len(prediction.outputs.names), PENALTY)])
-        low = np.concatenate([(-most_A / limit - u_s / limit) * ones, slopes - 1.0, under])
-        high = np.concatenate([(most_A / limit - u_s / limit) * ones, slopes + 1.0, over])
+        low = np.concatenate([(-most / limit - u_s / limit) * ones, slopes - 1.0, under])
+        high = np.concatenate([(most / limit - u_s / limit) * ones, slopes + 1.0, over])
         return q, low, high
 
     def _observe(self, kalman: EstimatorState, measurement: float) -> tuple[State, Float[np.ndarray, " 1"], State]:
@@ -411,10 +411,10 @@ class ForceMPC(ReadsLink, Result, Worded):
         return corrected, innovation, ahead
 
     def _targets(
-        self, drift: float, references: Float[np.ndarray, " p"], least_A: float, most_A: float
+        self, drift: float, references: Float[np.ndarray, " p"], least: float, most: float
     ) -> tuple[float, References]:
         """Return the current at rest for the last reference, and the nearest forces to all that the limits can hold."""
-        ends = self.prediction.outputs.admissible_rest(drift, least_A, most_A)
+        ends = self.prediction.outputs.admissible_rest(drift, least, most)
         currents = np.clip(references / self.static_gain - drift, *ends)
         first = min(self.kalman.delay_samples, references.size - 1)
         return float(currents[-1]), self.static_gain * (currents[first:] + drift)
@@ -513,7 +513,7 @@ def force_mpc(
     >>> spec = MPCSpec(current_limit_A=9.0, bandwidth_hz=20)
     >>> mpc = force_mpc(so.plants.high_impedance(), so.plants.thor(), spec)
     >>> step = mpc.step(mpc.start, reference_N=2000.0, measurement_N=0.0)
-    >>> mpc.feasible, step.solved, round(step.current_A, 3)
+    >>> mpc.feasible, step.solved, round(step.command, 3)
     (True, True, 7.99)
     """
     require_plant(plant, "plant", ControlError)
@@ -588,7 +588,7 @@ def _design(plant: Plant, values: ParameterSet, spec: MPCSpec, around: Mapping[s
     knots = spread_knots(spec.samples, spec.moves)
     outputs = bound_outputs(spec.bounds, kalman, sampled, interpolate_knots(knots), limit)
     preview = max(spec.preview_samples - kalman.delay_samples, 0)
-    prediction = condense(sampled, regulator, knots, limit, spec.slew_per_sample_A, preview, outputs)
+    prediction = condense(sampled, regulator, knots, limit, spec.slew_per_sample, preview, outputs)
     return ForceMPC(
         spec=spec,
         design=design,

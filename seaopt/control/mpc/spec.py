@@ -199,7 +199,7 @@ class MPCSpec(LoopSpec):
         return round(self.horizon_s * self.sample_rate_hz)
 
     @property
-    def slew_per_sample_A(self) -> float:
+    def slew_per_sample(self) -> float:
         """Largest change of current from one sample to the next; infinite without a limit."""
         slew = self.current_slew_A_per_s
         return np.inf if slew is None else slew * self.sample_time_s

@@ -29,7 +29,7 @@ class MPCState:
     Parameters
     ----------
     kalman : EstimatorState
-    current_A : float
+    command : float
         The last command.
     plan : array, shape (n,)
         The currents planned at the knots, A.
@@ -49,7 +49,7 @@ class MPCState:
     """
 
     kalman: EstimatorState
-    current_A: float
+    command: float
     plan: Float[np.ndarray, " n"]
     sides: Int[np.ndarray, " m"]
     age: int
@@ -65,7 +65,7 @@ class MPCStep:
 
     Parameters
     ----------
-    current_A : float
+    command : float
         The command, within limits.
     state : MPCState
         For the next step.
@@ -86,7 +86,7 @@ class MPCStep:
         The whole step's, in Python.
     """
 
-    current_A: float
+    command: float
     state: MPCState
     solved: bool
     status: str

@@ -35,18 +35,18 @@ class Equilibrium:
     """Where runs rest."""
 
     state: LoopState  # of plant, law and waiting commands
-    # reference, force, current_A, energy_J: shape (runs,); F_ref and the measured output (N); the current; what the
+    # reference, force, rest_command, energy_J: shape (runs,); F_ref and the measured output (N); the command; what the
     # plant stores, zero where it declares no energy
     reference: Runs
     given: Runs  # what the law is given for it: x_0 with an outer loop around it
     force: Runs
-    current_A: Runs
+    rest_command: Runs
     energy_J: Runs
     unit: str = LINEAR.unit  # of reference and force: N, or N m of a torque
     command: tuple[str, str] = ("I", "A")
 
     def __repr__(self) -> str:
-        rows = zip(self.force, self.current_A, strict=True)
+        rows = zip(self.force, self.rest_command, strict=True)
         return "Equilibrium at " + ", ".join(
             f"{force:.4g} {self.unit}, {show_command(current, *self.command)}" for force, current in rows
         )
@@ -95,7 +95,7 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters], variab
         reference=reference,
         given=given,
         force=force,
-        current_A=current,
+        rest_command=current,
         energy_J=energy,
         unit=unit,
         command=name_input(plant),
@@ -103,13 +103,13 @@ def equilibrium(loop: SampledLoop, params: Sequence[CompletedParameters], variab
 
 
 def _law_at_rest(
-    law: RunnableLaw, read: Reading, current_A: float, plant: Plant, measured: str
+    law: RunnableLaw, read: Reading, command: float, plant: Plant, measured: str
 ) -> tuple[Float[np.ndarray, " n"], float]:
     """Return the law's state and the reference at which it commands a current, unlimited, under constant readings."""
     n = law.c.size
     left = np.block([[np.eye(n) - law.a, -law.b_reference[:, None]], [law.c[None, :], np.array([[law.d_reference]])]])
     right = np.append(
-        -np.dot(law.b_measurement, read), current_A / law.per_effort + float(np.dot(law.d_measurement, read))
+        -np.dot(law.b_measurement, read), command / law.per_effort + float(np.dot(law.d_measurement, read))
     )
     try:
         solution = np.linalg.solve(left, right)
@@ -117,7 +117,7 @@ def _law_at_rest(
         solution = np.full(n + 1, np.nan)
     if not np.all(np.isfinite(solution)):
         raise ControlError(
-            f"no reference makes the law command the {show_command(current_A, *name_input(plant))} that rest takes at "
+            f"no reference makes the law command the {show_command(command, *name_input(plant))} that rest takes at "
             f"{float(np.ravel(read)[0]):.4g} {plant.outputs[measured]}; its "
             "reference path is blocked at 0 Hz"
         )

@@ -28,14 +28,14 @@ from seaopt.control.loops.sampled_plant import (
     read_conditions,
     whole_samples,
 )
-from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RESTS, RTOL
-from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, runge_kutta
-from seaopt.control.running.sampled_loop import largest_current
-from seaopt.errors import ControlError, SimulationError, require_seed
+from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RTOL, STICKING_RTOL
+from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, advance_function, observe_function
+from seaopt.control.running.sampled_loop import channel_names, largest_command
+from seaopt.errors import ControlError, StepSizeError, require_seed
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
-from seaopt.plants.plant import name_input, output_function
+from seaopt.plants.plant import name_input
 from seaopt.plants.sensors.deflection import evaluate_weights
 from seaopt.records import record
 from seaopt.simulation.direct_call import DirectCall
@@ -43,6 +43,7 @@ from seaopt.units import LINEAR, mechanics_of, name_command, unit_after
 
 State = TypeVar("State")
 FIRST_SUBSTEPS = 2  # coarse steps per sample to begin with
+STANDS = 1e-8  # of the largest state so far: a speed below it, of a plant that rests away from zero, is rounding
 
 
 @record(eq=False)
@@ -57,7 +58,9 @@ class ForceRun:
     state : array, shape (n, nx)
         Of the plant.
     outputs : mapping of name to array, shape (n,)
-        Of the plant at the samples, without the sensors' errors.
+        Of the plant at the samples, without the sensors' errors, and "energy" (J) where the plant declares it.
+    peaks : mapping of name to float
+        Largest magnitude of each over all integration steps.
     error : float
         Estimated integration error of the worst sample, over the state's largest value until then.
     substeps : int
@@ -73,6 +76,7 @@ class ForceRun:
     law_time_s: Float[np.ndarray, " n"]
     state: Float[np.ndarray, "n nx"]
     outputs: Mapping[str, Float[np.ndarray, " n"]]
+    peaks: Mapping[str, float]
     error: float
     substeps: int
     unit: str = LINEAR.unit
@@ -120,11 +124,12 @@ def close_loop(
     sensors: Sensors | None = None,
     command_step: float = 0.0,
     command_limit: float = np.inf,
-    disturbance_A: float | Float[np.ndarray, " n"] = 0.0,
+    disturbance: float | Float[np.ndarray, " n"] = 0.0,
     seed: int = 0,
     start_state: Float[np.ndarray, " nx"] | None = None,
     start_command: float = 0.0,
-    rtol: float = RTOL,
+    sticks: bool = False,
+    rtol: float | None = None,
 ) -> ForceRun:
     """Run a law on a plant, from rest at zero where no other start is given.
 
@@ -156,7 +161,7 @@ def close_loop(
         What the amplifier rounds the command to, in its unit; 0 for not at all.
     command_limit : float
         The amplifier's; with a step the largest is the last whole one within it.
-    disturbance_A : float or array, shape (n,)
+    disturbance : float or array, shape (n,)
         Added to the current inside the plant.
     seed : int
         Of the noise.
@@ -164,25 +169,28 @@ def close_loop(
         Of the plant, at the first sample.
     start_command : float
         What acts until the first command does.
-    rtol : float
+    sticks : bool
+        Dry friction jumps at rest, so that what sticks stands still, in place of the smoothed curve.
+    rtol : float, optional
         Of the integration, of each state's largest value so far.
 
     Raises
     ------
     ControlError
         `preview_samples` is no number of samples, the plant has no such output, or that output responds to the
-        current at once, the parameters contain another condition than delays, a sensor's error or command_step is
-        negative, that step is above the limit, or the loop diverges.
+        current at once, the parameters contain another condition than delays and no `start_state` is given, a sensor's
+        error or command_step is negative, that step is above the limit, or the loop diverges.
     SimulationError
         No number of steps reaches `rtol`.
     """
     values = plant.complete(params)
-    extra_delay_s = _check(plant, values, measured, delay_samples)
+    extra_delay_s = _check(plant, values, measured, delay_samples, placed=start_state is not None)
     whole, rest_s = whole_samples(extra_delay_s, sample_time_s)
     if isinstance(preview_samples, bool) or not isinstance(preview_samples, int) or preview_samples < 0:
         raise ControlError(f"preview_samples = {preview_samples!r} is not a whole number of samples; give 0, 1, ...")
     newer, n, p = delay_samples + whole, reference.size, values.vector
-    output, integrator = DirectCall(output_function(plant)), _Integrator(plant=plant, rtol=rtol)
+    output, names = DirectCall(observe_function(plant, sticks)), channel_names(plant)
+    integrator = _Integrator(plant=plant, sticks=sticks, rtol=rtol or (STICKING_RTOL if sticks else RTOL))
     idle = [0.0] * (len(plant.inputs) - 1)
     devices, signals = sensors or Sensors(), list_names(measured)
     rng = np.random.default_rng(require_seed(seed, ControlError))
@@ -190,16 +198,16 @@ def close_loop(
     noise = np.array([devices.combine_errors(plant, values, name)[0] * rng.normal(size=n) for name in signals])
     if not command_step >= 0.0:
         raise ControlError(f"command_step = {command_step:g} is negative; give the amplifier's step, 0 for none")
-    most = largest_current(command_limit, command_step)
+    most = largest_command(command_limit, command_step)
     if not most:
         raise ControlError(
             f"command_step = {command_step:g} is above the limit of the command, {command_limit:g}, so that "
             "every command is zero; give the amplifier's step"
         )
-    disturbance = np.broadcast_to(np.asarray(disturbance_A, dtype=float), n)
+    disturbance = np.broadcast_to(np.asarray(disturbance, dtype=float), n)
     x = np.zeros(len(plant.states)) if start_state is None else start_state
     law, time_s = start, sample_time_s * np.arange(n)
-    made, current, law_time_s, states = np.zeros((n, len(plant.outputs))), *np.zeros((2, n)), np.zeros((n, len(x)))
+    made, current, law_time_s, states = np.zeros((n, len(names))), *np.zeros((2, n)), np.zeros((n, len(x)))
 
     def inputs(k: int, sample: int) -> list[float]:
         return [(current[sample] if sample >= 0 else start_command) + disturbance[k], *idle]
@@ -224,7 +232,8 @@ def close_loop(
         current=current,
         law_time_s=law_time_s,
         state=states,
-        outputs=dict(zip(plant.outputs, made.T, strict=True)),
+        outputs=dict(zip(names, made.T, strict=True)),
+        peaks=dict(zip(names, np.maximum(integrator.peak, np.max(np.abs(made), axis=0)).tolist(), strict=True)),
         error=integrator.error,
         substeps=2 * integrator.substeps,
         unit=plant.outputs[signals[0]],
@@ -232,10 +241,10 @@ def close_loop(
     )
 
 
-def _convert_command(command: float, step_A: float, most_A: float) -> float:
+def _convert_command(command: float, step: float, most: float) -> float:
     """Return what an amplifier makes of a command: the nearest step, within its limit."""
-    rounded = step_A * math.floor(command / step_A + 0.5) if step_A else command
-    return min(max(rounded, -most_A), most_A)
+    rounded = step * math.floor(command / step + 0.5) if step else command
+    return min(max(rounded, -most), most)
 
 
 def _place_sensor(
@@ -257,12 +266,12 @@ def _place_sensor(
     return read
 
 
-def _check(plant: Plant, params: CompletedParameters, measured: Measured, delay_samples: int) -> float:
+def _check(plant: Plant, params: CompletedParameters, measured: Measured, delay_samples: int, *, placed: bool) -> float:
     """Return the delay besides the whole samples, s, of arguments that fit together."""
     rows = find_rows(plant, measured)
     conditions = read_conditions(plant, params)
     moved = [name for name, value in conditions.items() if value and name not in DELAYS]
-    if moved:
+    if moved and not placed:
         raise ControlError(
             f"the parameters hold {', '.join(moved)}, but close_loop starts at rest at zero; leave it out"
         )
@@ -281,10 +290,12 @@ class _Integrator:
     """A plant integrated while its inputs are held, in as many steps as it has needed so far."""
 
     plant: Plant
+    sticks: bool
     rtol: float
     substeps: int = FIRST_SUBSTEPS
     error: float = 0.0
     size: Any = 0.0
+    peak: Any = 0.0  # largest magnitudes of the outputs
     ends: DirectCall | None = None
 
     def advance(
@@ -292,21 +303,22 @@ class _Integrator:
     ) -> Any:
         """Return the state after a time `lasting`, the inputs held."""
         while True:
-            self.ends = self.ends or DirectCall(_ends(self.plant, self.substeps))
-            coarse, fine = (end[:, 0] for end in self.ends(t, x, u, p, lasting))
+            self.ends = self.ends or DirectCall(_ends(self.plant, self.substeps, self.sticks))
+            coarse, fine, peak = (end[:, 0] for end in self.ends(t, x, u, p, lasting))
             size = np.maximum(self.size, np.maximum(np.abs(x), np.abs(fine)))
-            scale = np.maximum(size, RESTS * np.max(size))
+            scale = np.maximum(size, STANDS * np.max(size))
             with np.errstate(invalid="ignore"):
-                error = float(np.max(np.abs(fine - coarse) / np.where(scale > 0.0, scale, 1.0))) / 15.0
+                error = float(np.max(np.abs(fine - coarse) / np.where(scale > 0.0, scale, 1.0)))
+            error /= 1.0 if self.sticks else 15.0
             if error <= self.rtol:
-                self.error, self.size = max(self.error, error), size
+                self.error, self.size, self.peak = max(self.error, error), size, np.maximum(self.peak, peak)
                 return fine
             if 2 * self.substeps > MAX_LOOP_SUBSTEPS:
                 break
             self.substeps, self.ends = 2 * self.substeps, None
         if not np.all(np.isfinite(fine)):
             raise ControlError(f"the loop on {self.plant.name} runs away at t = {t:g} s; tune it again")
-        raise SimulationError(
+        raise StepSizeError(
             f"plant {self.plant.name}: {2 * self.substeps} steps per sample leave an error of {error:.1e} of a state "
             f"at t = {t:g} s (rtol = {self.rtol:g}); check the parameters and that the loop does not run away, smooth "
             "the friction (v_s), or raise rtol"
@@ -314,15 +326,19 @@ class _Integrator:
 
 
 @memo
-def _ends(plant: Plant, substeps: int) -> Any:
-    """Return the CasADi function (t, x, u, p, T) -> x after T in `substeps` steps and in twice as many."""
-    step = runge_kutta(plant)
-    t, x, u, p, lasting = (ca.MX.sym(name, step.numel_in(i)) for i, name in enumerate("txupT"))
-    ends: list[Any] = []
+def _ends(plant: Plant, substeps: int, sticks: bool) -> Any:
+    """Return the CasADi function (t, x, u, p, T) -> x after T in `substeps` steps and in twice as many, and the largest
+    outputs of these.
+    """
+    step = advance_function(plant, sticks)
+    t, x, u, p, lasting = (
+        ca.MX.sym(name, size) for name, size in zip("txupT", map(step.numel_in, (0, 1, 3, 4, 5)), strict=True)
+    )
+    ends, top = list[Any](), None
     for count in (substeps, 2 * substeps):
-        at, h = x, lasting / count
+        at, top, h = x, ca.MX.zeros(step.numel_in(2)), lasting / count
         for i in range(count):
-            at = step(t + i * h, at, u, p, h)
+            at, top = step(t + i * h, at, top, u, p, h)
         ends.append(ca.densify(at))
-    whole = ca.Function("held", [t, x, u, p, lasting], ends)
+    whole = ca.Function("held", [t, x, u, p, lasting], [*ends, ca.densify(top)])
     return whole.expand() if substeps <= MAX_EXPANDED_STEPS else whole

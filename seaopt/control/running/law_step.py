@@ -113,7 +113,7 @@ def list_numbers(law: RunnableLaw | RunnableSchedule) -> Float[np.ndarray, " m"]
     gate, limit = law.gate, law.force_limit_N if np.isfinite(law.command_limit) else 0.0
     numbers = [limit, law.per_effort]
     if gate is not None:
-        numbers += [*gate.range_N, gate.max_step_N, gate.max_held, gate.ramp_A_per_s * law.sample_time_s]
+        numbers += [*gate.range_N, gate.max_step_N, gate.max_held, gate.ramp_per_s * law.sample_time_s]
         numbers += [] if gate.agreement is None else gate.agreement.numbers
     numbers += [] if law.heat is None else law.heat.numbers
     numbers += [] if law.outer is None else law.outer.numbers
@@ -134,7 +134,7 @@ def list_kept(law: RunnableLaw | RunnableSchedule, state: LawState) -> Float[np.
         () if law.heat is None else state.heat,
         (state.place,) if isinstance(state, ScheduleState) else (),
         () if law.outer is None else state.outer,
-        (state.current_A,),
+        (state.command,),
     )
     return np.concatenate(parts).astype(float)
 

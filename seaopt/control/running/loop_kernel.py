@@ -171,7 +171,7 @@ def _sample_function(plant: Plant, structure: _Structure) -> Any:
 
 
 def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
-    numbers = [loop.command_step, loop.most_A if math.isfinite(loop.most_A) else 0.0]
+    numbers = [loop.command_step, loop.most if math.isfinite(loop.most) else 0.0]
     for name in (*loop.signals, *loop.encoders):
         numbers += _describe_device(loop.sensors, name)[1]
     return np.concatenate([list_numbers(loop.law), numbers])
@@ -193,7 +193,8 @@ def runge_kutta(plant: Plant) -> Any:
     return ca.Function("step", [t, x, u, p, h], [ca.densify(after)])
 
 
-def _advance_function(plant: Plant, sticks: bool) -> Any:
+@memo
+def advance_function(plant: Plant, sticks: bool) -> Any:
     """Return the CasADi function (t, x, peak, u, p, h) -> (x+, peak+): one integration step, and the largest |y|."""
     t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
     peak = ca.SX.sym("peak", len(channel_names(plant)))
@@ -206,7 +207,7 @@ def _advance_function(plant: Plant, sticks: bool) -> Any:
 @memo
 def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Any, Kernel | None]:
     """Return the functions of one sample and of one step, and their library where there is a compiler."""
-    sample, advance = _sample_function(plant, structure), _advance_function(plant, structure.sticks)
+    sample, advance = _sample_function(plant, structure), advance_function(plant, structure.sticks)
     return sample, advance, load_kernel(_source(plant, structure, sample, advance), "seaopt_loops")
 
 

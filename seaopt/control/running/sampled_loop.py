@@ -94,7 +94,7 @@ class SampledLoop:
             if not getattr(self, name) >= 0.0:
                 raise SimulationError(f"{name} = {getattr(self, name):g} is negative; give zero or more")
         self.sensors.refuse_negative((*self.signals, *self.encoders), SimulationError)
-        if self.command_step and not self.most_A:
+        if self.command_step and not self.most:
             limit = show_command(self.law.command_limit, *self.law.command)
             raise SimulationError(
                 f"command_step = {self.command_step:g} is above the limit of {limit}, so that every command but "
@@ -154,9 +154,9 @@ class SampledLoop:
         return self.delay_samples + whole_samples(self.longest_delay_s, self.law.sample_time_s)[0] + 1
 
     @property
-    def most_A(self) -> float:
+    def most(self) -> float:
         """The largest current: the law's limit, or the last whole step of the amplifier within it."""
-        return largest_current(self.law.command_limit, self.command_step)
+        return largest_command(self.law.command_limit, self.command_step)
 
 
 def find_longest_delay(plant: Plant, params: Iterable[ParameterSet]) -> float:
@@ -184,8 +184,8 @@ def at_rest(loop: SampledLoop, runs: int = 1, x: Float[np.ndarray, " nx"] | None
     return LoopState(x=np.tile(start, (runs, 1)), z=np.tile(z, (runs, 1)))
 
 
-def largest_current(limit_A: float, step_A: float) -> float:
+def largest_command(limit: float, step: float) -> float:
     """Return the last whole step within a current limit; the limit itself without a step."""
-    if not step_A or math.isinf(limit_A):
-        return limit_A
-    return step_A * math.floor(limit_A / step_A * (1.0 + 1e-12))
+    if not step or math.isinf(limit):
+        return limit
+    return step * math.floor(limit / step * (1.0 + 1e-12))

@@ -161,7 +161,7 @@ class RunnableSchedule(Guarded):
         reference: float = 0.0,
         measurement: Reading | None = None,
         place: float = math.nan,
-        current_A: float = 0.0,
+        command: float = 0.0,
         heat: tuple[float, float] = COLD,
         readings: Sequence[float] = (),
     ) -> ScheduleState:
@@ -173,12 +173,12 @@ class RunnableSchedule(Guarded):
         missing = not is_number(place)
         at = self.fallback if missing else place
         numbers = self.find_terms(at)
-        reference, measurement, effort, seen = self.begin(reference, measurement, current_A, readings, numbers)
+        reference, measurement, effort, seen = self.begin(reference, measurement, command, readings, numbers)
         x = self.table.order.continue_from(
             self.table.find_numbers(at), effort, reference, np.ravel(measurement).tolist()
         )
         return ScheduleState(
-            x=np.array(list(x.values())), current_A=current_A, gate=seen, heat=heat, place=at, misplaced=int(missing)
+            x=np.array(list(x.values())), command=command, gate=seen, heat=heat, place=at, misplaced=int(missing)
         )
 
     def freeze(self, place: float, compensation: Compensation | None = None) -> RunnableLaw:

@@ -129,6 +129,11 @@ class CheckContext:
         return self.subject
 
     @property
+    def plan(self) -> ForceMPC | None:
+        """The subject where it is predictive control."""
+        return self.subject if isinstance(self.subject, ForceMPC) else None
+
+    @property
     def ends_early(self) -> bool:
         """Whether what takes long is left out: a requirement is broken, or will be, as a draw fails."""
         draws = self.found.get("monte_carlo")

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
-from seaopt.control import Controller, LoopFigures, ScheduledController
+from seaopt.control import Controller, ForceMPC, LoopFigures, ScheduledController
 from seaopt.control.laws.limits import BY_NAME
 from seaopt.control.laws.structures import CUSTOM
 from seaopt.control.loops.absolute_stability import FrictionMargin
@@ -316,16 +316,17 @@ class Certificate(Result, Worded):
         *,
         ranges: Ranges | None = None,
         others: ParameterSet | None = None,
+        plan: ForceMPC | None = None,
     ) -> Certificate:
         """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated.
 
-        Arguments are those of `certify`; of predictive control `law` is `linear_controller` of it. Raises FileError: a
-        field is missing or malformed, it was edited or written by hand, or nothing is required in it.
+        Arguments are those of `certify`; of predictive control, the `plan`, `law` is `linear_controller` of it. Raises
+        FileError: a field is missing or malformed, it was edited or written by hand, or nothing is required in it.
         """
         from seaopt.robustness.certificate import stored  # deferred: it reads these
 
         posed = pose(law, plants, parameters, ranges or {}, others or ParameterSet())
-        return stored.build_certificate(content, law, posed)
+        return stored.build_certificate(content, law, posed, plan)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of robustness.json (schema seaopt/robustness/3), with its digest."""

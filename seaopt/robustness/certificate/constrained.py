@@ -25,15 +25,9 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
-from seaopt.control import (
-    ForceMPC,
-    ForceRun,
-    MPCStep,
-    close_loop,
-)
-from seaopt.control.loops.outer_loop import FIRST, follow_link
+from seaopt.control import ForceMPC, ForceRun
 from seaopt.control.loops.sampled_plant import DELAYS, conditions
-from seaopt.control.mpc.active_set import UNFINISHED
+from seaopt.control.mpc.compiled import PlanSample
 from seaopt.errors import SeaoptError
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count
@@ -49,7 +43,7 @@ from seaopt.robustness.uncertainty.worst import place_values
 from seaopt.robustness.verification.judgement import Fault, Judge, find_noise_floor, take_ends
 from seaopt.robustness.verification.linear import LinearView, view_loop
 from seaopt.robustness.verification.oscillation import Oscillation, Signal, measure_swing
-from seaopt.robustness.verification.playback import Rig
+from seaopt.robustness.verification.playback import Rig, run_plan
 from seaopt.robustness.verification.scenarios import SETTLED
 from seaopt.robustness.verification.verification import make_rigs
 from seaopt.units import LINEAR
@@ -209,21 +203,21 @@ class _PlantRun:
 
     def play(self) -> _RunResult:
         """Simulate the run, and judge it."""
-        mpc, judge, steps, figures = self.mpc, Judge(), list[MPCStep](), dict[str, Any]()
+        mpc, judge, steps, figures = self.mpc, Judge(), list[PlanSample](), dict[str, Any]()
         try:
             run = self._simulate(steps)
         except SeaoptError as error:
             judge.refuse(DIVERGED, str(error))
         else:
-            figures = self._judge(run, np.array([step.target_N for step in steps]), judge)
-        current = np.array([step.current_A for step in steps])  # before the amplifier rounds it
-        slews = np.abs(np.diff(current, prepend=0.0)) > mpc.spec.slew_per_sample_A * (1.0 - 1e-6)
+            figures = self._judge(run, np.array([step.target for step in steps]), judge)
+        current = np.array([step.command for step in steps])  # before the amplifier rounds it
+        slews = np.abs(np.diff(current, prepend=0.0)) > mpc.spec.slew_per_sample * (1.0 - 1e-6)
         at_limit = int(np.count_nonzero(slews | (np.abs(current) > mpc.command_limit * (1.0 - 1e-6))))
         return _RunResult(
             fault=judge.faults[0] if judge.faults else None,
             steps=len(steps),
             unsolved=sum(not step.solved for step in steps),
-            late=sum(step.status.startswith(UNFINISHED) and not step.solved for step in steps),
+            late=sum(step.unfinished for step in steps),
             iterations=max((step.iterations for step in steps), default=0),
             at_limit=at_limit,
             **figures,
@@ -237,39 +231,21 @@ class _PlantRun:
         judge.require(OVER_BOUND, violation, self.tolerance, beyond)
         return {"violation": violation, "signal": signal, "ring": self._judge_ring(run, judge)}
 
-    def _simulate(self, steps: list[MPCStep]) -> ForceRun:
-        """Return the samples of the run, and add each step of the law to `steps`. An outer loop is given what it makes
-        the reference of, an x_0 or a force, and asks for the force of one sample: with it there is no preview.
+    def _simulate(self, steps: list[PlanSample]) -> ForceRun:
+        """Return the samples of the run, and add each step of the law to `steps`; with an outer loop there is no
+        preview.
         """
         mpc, rig = self.mpc, self.rig
-        outer, reads = mpc.outer, mpc.reads
-        named = (*reads, *(() if outer is None else (outer.position,)))
-        moved = tuple(dict.fromkeys(name for name in named if name in rig.plant.outputs))
-
-        def law(state: Any, r: Any, y: Any) -> tuple[float, Any]:
-            (plan, kept), (force, *positions) = state, np.ravel(y).tolist()
-            places = dict(zip(moved, positions, strict=True))
-            if outer is not None:
-                x_0, besides = outer.split(r / outer.per_given)
-                kept = follow_link(outer.numbers, kept, x_0, places.get(outer.position, 0.0))
-                r = besides + kept[-1]
-            steps.append(mpc.step(plan, r, force, [places.get(name, 0.0) for name in reads]))
-            return steps[-1].current_A, (steps[-1].state, kept)
-
-        return close_loop(
-            law,
-            (mpc.start, FIRST),
+        return run_plan(
+            mpc,
             rig.plant,
             self.values,
             self.drawn.reference,
-            measured=(mpc.measured, *moved),
-            sample_time_s=mpc.sample_time_s,
-            delay_samples=mpc.compute_delay_samples,
-            preview_samples=mpc.spec.preview_samples if outer is None else 0,
+            steps,
+            preview_samples=mpc.spec.preview_samples if mpc.outer is None else 0,
             sensors=rig.sensors,
             command_step=rig.command_step,
-            command_limit=mpc.command_limit,
-            disturbance_A=self.drawn.disturbance,
+            disturbance=self.drawn.disturbance,
             seed=self.drawn.seed,
         )
 
@@ -361,14 +337,14 @@ def measure_constrained(context: CheckContext, progress: Progress) -> Evidence:
 CONSTRAINED = Check(
     measure=measure_constrained,
     seconds=lambda context: RUN_SECONDS * context.options.runs * len(context.cases.models),
-    applies=lambda context: isinstance(context.subject, ForceMPC),
+    applies=lambda context: context.plan is not None,
 )
 
 
 def run_constrained(context: CheckContext, progress: Progress) -> ConstrainedRuns:
     """Return what runs with limits active come to; the context's law is the linear region of its subject."""
-    mpc = context.subject
-    assert isinstance(mpc, ForceMPC)
+    mpc = context.plan
+    assert mpc is not None
     law, plants, unknown = context.cases.controller, context.cases.models, context.cases.unknown
     runs, seed, sensors = context.options.runs, context.options.seed, context.sensors or Sensors()
     tolerance, command_step = context.options.bound_tolerance, context.options.command_step

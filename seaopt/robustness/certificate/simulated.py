@@ -16,7 +16,7 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.codec import to_content
-from seaopt.control import Controller
+from seaopt.control import Controller, ForceMPC
 from seaopt.control.laws.passivity import Passivity, passivity
 from seaopt.errors import ControlError, SeaoptError
 from seaopt.executors import Shared, map_ordered
@@ -34,7 +34,7 @@ from seaopt.robustness.verification.environments import StabilityMap, coupled_st
 from seaopt.robustness.verification.judgement import LOST, Fault, Outcome
 from seaopt.robustness.verification.large_signal import LargeSignal, large_signal
 from seaopt.robustness.verification.limit_cycles import FoundCycle, list_step_cycles, seek_limit_cycles
-from seaopt.robustness.verification.scenarios import step_scenarios
+from seaopt.robustness.verification.scenarios import Scenario, step_scenarios
 from seaopt.robustness.verification.verification import Verification, check_plants, check_sensors, verify
 
 Played = TypeVar("Played")
@@ -110,8 +110,9 @@ def measure_steps(context: CheckContext, progress: Progress) -> Evidence:
             cases.controller,
             models,
             unknown.nominal,
-            scenarios=step_scenarios,
+            scenarios=step_scenarios if context.plan is None else partial(_list_plan_steps, context.plan),
             draws=list_worst_draws(models, unknown.nominal, unknown.varied(), found["worst"]),
+            plan=context.plan,
             executor=context.executor,
             progress=progress,
             seed=context.options.seed,
@@ -135,6 +136,18 @@ def measure_steps(context: CheckContext, progress: Progress) -> Evidence:
     )
     rows = () if context.simulations else require_runs(steps)  # else those scenarios are judged
     return Evidence(requirements=(*lasting, *rows), fields={"steps": steps, "cycles": cycles}, scope="simulated")
+
+
+def _list_plan_steps(
+    plan: ForceMPC, controller: Controller, plant: Plant, sets: Sequence[ParameterSet]
+) -> tuple[Scenario, ...]:
+    """Return steps in sizes of what the bounds of outputs let a plan hold, too."""
+    spec, most = plan.spec, plan.command_limit
+    low, high = plan.prediction.outputs.admissible_rest(0.0, -most, most)
+    held = min(-low, high)
+    key = "command_limit" if spec.current_limit_A is None else "current_limit_A"
+    limited = replace(controller.spec, **{key: held if held > 0.0 else most})
+    return step_scenarios(replace(controller, spec=limited), plant, sets)
 
 
 def measure_simulations(context: CheckContext, progress: Progress) -> Evidence:

@@ -13,7 +13,7 @@ import numpy as np
 
 from seaopt.bench import Sensors
 from seaopt.codec import from_content, join_schemas
-from seaopt.control import Controller, LoopFigures, ScheduledController
+from seaopt.control import Controller, ForceMPC, LoopFigures, ScheduledController
 from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.running.fed_back import close_whole, feeds_back, split_states
 from seaopt.errors import FileError, SeaoptError
@@ -171,12 +171,15 @@ def read_certificate(content: Mapping[str, Any]) -> StoredCertificate:
 
 
 def build_certificate(
-    content: Mapping[str, Any], law: Controller | ScheduledController, posed: Mapping[float | None, Cases]
+    content: Mapping[str, Any],
+    law: Controller | ScheduledController,
+    posed: Mapping[float | None, Cases],
+    plan: ForceMPC | None = None,
 ) -> Certificate:
     """Return the certificate of a robustness.json, as `Certificate.from_dict` does."""
     if isinstance(law, Controller):
         (cases,) = posed.values()
-        return _build_one(read_certificate(content), content, cases, None)
+        return _build_one(read_certificate(content), content, cases, None, plan)
     check_file(content, of_schedule=True)
     stored = from_content(StoredScheduleCertificate, content, FILE, remedy=CERTIFY_AGAIN)
     of_schedule = stored.schedule
@@ -207,7 +210,11 @@ def build_certificate(
 
 
 def _build_one(
-    stored: StoredCertificate, content: Mapping[str, Any], cases: Cases, place: tuple[str, float] | None
+    stored: StoredCertificate,
+    content: Mapping[str, Any],
+    cases: Cases,
+    place: tuple[str, float] | None,
+    plan: ForceMPC | None = None,
 ) -> Certificate:
     """Return the certificate of what a robustness.json holds of one law."""
     controller, models, parameters = cases.controller, cases.models, cases.unknown.nominal
@@ -260,7 +267,7 @@ def _build_one(
             constrained=stored.constrained,
             remarks=stored.remarks,
         )
-        return _restore_runs(certificate, stored, plain(content))
+        return _restore_runs(certificate, stored, plain(content), plan)
     except FileError:
         raise
     except SeaoptError as error:
@@ -278,7 +285,9 @@ def _check_current(name: str, written: Mapping[str, Any], figures: LoopFigures) 
             )
 
 
-def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: Mapping[str, Any]) -> Certificate:
+def _restore_runs(
+    certificate: Certificate, stored: StoredCertificate, content: Mapping[str, Any], plan: ForceMPC | None
+) -> Certificate:
     """Return a certificate with what its file says of steps, limit cycles and scenarios."""
     if not certificate.models:
         return replace(certificate, steps=NO_MODEL)
@@ -286,7 +295,7 @@ def _restore_runs(certificate: Certificate, stored: StoredCertificate, content: 
     draws = {name: (certificate.parameters, *drawn) for name, drawn in certificate.list_draws().items()}
 
     def restore(rows: Mapping[str, Any], sensors: Sensors | None, command_step: float) -> Verification | None:
-        rigs = make_rigs(certificate.controller, certificate.simulated_models, sensors, command_step)
+        rigs = make_rigs(certificate.controller, certificate.simulated_models, sensors, command_step, plan=plan)
         return Verification.from_dict(rows, rigs, draws, FILE, CERTIFY_AGAIN) if "rows" in rows else None
 
     devices = (None, 0.0) if runs is None else (runs.sensors, runs.command_step)

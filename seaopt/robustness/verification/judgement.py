@@ -39,7 +39,7 @@ from jaxtyping import Float
 
 from seaopt.codec import Key, OrInfinite, OrNaN
 from seaopt.control.running.closed_loop import ENERGY
-from seaopt.control.running.sampled_loop import largest_current
+from seaopt.control.running.sampled_loop import largest_command
 from seaopt.formatting import format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import find_locked_modes
@@ -96,7 +96,7 @@ class Outcome(Result):
         What failed.
     parameters : mapping of name to float
         Where the draw differs from nominal: with scenario, plant and seed, the witness.
-    peak_force_N, peak_current_A : float
+    peak_force_N, peak_command : float
         Peaks of the measured output (in its unit), between samples too, and of the command.
     saturated : float
         Share of the samples at the current limit.
@@ -118,7 +118,8 @@ class Outcome(Result):
 
     json_keys = (
         "met", "passed", "reason", "scenario", "plant", "draw", Key(field="kinds", name="faults"),
-        Key(field="faults", name="findings"), "parameters", "peak_force_N", "peak_current_A", "saturated",
+        Key(field="faults", name="findings"), "parameters", "peak_force_N",
+        Key(field="peak_command", name="peak_current_A"), "saturated",
         "peak_angle_rad", "peak_energy_J", "energy_growth", "final_error_N", "limit_cycle_N", "limit_cycle_hz",
         "overshoot", "settling_s", "overshoot_by_limit", "contact_impulse", "contact_loss_J",
     )  # fmt: skip
@@ -129,7 +130,7 @@ class Outcome(Result):
     faults: tuple[Fault, ...]
     parameters: Mapping[str, float]
     peak_force_N: OrInfinite
-    peak_current_A: OrInfinite
+    peak_command: OrInfinite
     saturated: OrNaN
     peak_angle_rad: float | None = None
     peak_energy_J: float | None = None
@@ -293,11 +294,11 @@ def _judge_extremes(run: _TraceRun, judge: Judge) -> None:
     force = float(trace.peaks[run.regulated][index])
     angles = [float(trace.peaks[name][index]) for name, unit in run.rig.plant.outputs.items() if unit == "rad"]
     current, limit = float(np.max(np.abs(trace.current[index]))), run.rig.controller.command_limit
-    most = largest_current(math.inf if limit is None else limit, run.rig.command_step)
+    most = largest_command(math.inf if limit is None else limit, run.rig.command_step)
     hardest = max(trace.contacts, key=lambda contact: abs(contact.impulse[index]), default=None)
     judge.figures.update(
         peak_force_N=force,
-        peak_current_A=current,
+        peak_command=current,
         peak_angle_rad=max(angles) if angles else None,
         saturated=find_saturated(trace.current[index], most),
         peak_energy_J=float(trace.peaks[ENERGY][index]) if ENERGY in trace.peaks else None,
@@ -326,9 +327,9 @@ def _judge_rest(run: _TraceRun, drawn: ParameterSet, judge: Judge) -> None:
     start, limit, command = run.trace.equilibrium, run.rig.controller.command_limit, run.rig.controller.command
     if start is None or limit is None:
         return
-    takes = abs(float(start.current_A[run.index]))
+    takes = abs(float(start.rest_command[run.index]))
     where = format_values({name: drawn[name].value for name in run.rig.plant.states if name in drawn}, missing="")
-    taken = command.show(float(start.current_A[run.index]))
+    taken = command.show(float(start.rest_command[run.index]))
     text = f"to rest at {where} takes {taken}, above the limit of {command.show(limit)}"
     judge.require("rest", takes, limit * (1.0 + ABOVE_LIMIT), text, command.unit, remedy="narrow its range")
 

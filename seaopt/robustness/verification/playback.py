@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from seaopt.bench import Sensors, excite
-from seaopt.control import Controller
+from seaopt.control import Controller, ForceMPC, ForceRun, MPCState, close_loop
 from seaopt.control.laws.realisation import RunnableLaw, runnable
+from seaopt.control.loops.outer_loop import FIRST, follow_link
 from seaopt.control.loops.sampled_plant import DELAYS, find_rows
+from seaopt.control.mpc.compiled import PlanSample, make_stepper
+from seaopt.control.mpc.step import add_terms, rest_filter
 from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, at_rest, describe_runs, run_loop
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.control.running.law_step import find_faults
@@ -39,6 +44,7 @@ class Rig:
     partner: Plant | None = None  # the same actuator with that link fixed, for phases in which it is held
     sensors: Sensors = field(default_factory=Sensors)
     command_step: float = 0.0
+    plan: ForceMPC | None = None  # predictive control, whose linear region the controller is
 
     def loop(self, held: bool, longest_delay_s: float = 0.0, *, sticks: bool = False) -> SampledLoop:
         """Return the loop with the link held or not, with friction as its curve says or one that sticks."""
@@ -63,10 +69,10 @@ class Rig:
 
     @property
     def unlimited(self) -> Rig:
-        """The rig with no limit of the command."""
+        """The rig with no limit of the command; of predictive control its linear region."""
         spec = replace(self.controller.spec, current_limit_A=None, command_limit=None)
         command = replace(self.controller.command, largest=None)
-        return replace(self, controller=replace(self.controller, spec=spec, command=command, derate=False))
+        return replace(self, controller=replace(self.controller, spec=spec, command=command, derate=False), plan=None)
 
     @property
     def is_ideal(self) -> bool:
@@ -149,6 +155,8 @@ def play(rig: Rig, scenario: Scenario, params: Sequence[ParameterSet], *, seed: 
     offset = start.given[:, None] if start is not None and scenario.about_rest else np.zeros((len(params), 1))
     outer = rig.law.outer
     per_force = 1.0 if outer is None else 1.0 / outer.per_given
+    if rig.plan is not None and start is not None:
+        return _play_plan(rig, rig.plan, scenario, placed, start, offset, per_force, seed)
     runs: list[LoopRun] = []
     positions: list[RunSamples] = []  # of the link, as the outer loop reads it
     contacts: list[Contact] = []
@@ -188,6 +196,130 @@ def play(rig: Rig, scenario: Scenario, params: Sequence[ParameterSet], *, seed: 
             positions.append(run.outputs.get(outer.position, np.broadcast_to(still[:, None], run.reference.shape)))
     played = _join_phases(rig, runs, start, tuple(contacts))
     return played if outer is None else replace(played, reference=outer.ask(played.reference, np.hstack(positions)))
+
+
+def _play_plan(
+    rig: Rig,
+    plan: ForceMPC,
+    scenario: Scenario,
+    values: Sequence[CompletedParameters],
+    start: Equilibrium,
+    offset: Float[np.ndarray, "runs 1"],
+    per_force: float,
+    seed: int,
+) -> Playback:
+    """Simulate phases of forces alone with predictive control as exported: steps that nobody knew ahead of."""
+    began, outer, names = time.perf_counter(), plan.outer, channel_names(rig.plant)
+    rng = np.random.default_rng(require_seed(seed, ControlError))
+    parts = [_build_reference(phase, plan.sample_time_s, rng) for phase in scenario.phases]
+    given, wanted = np.concatenate(parts), list[Signal]()
+    runs, ended = list[ForceRun](), list[PlanSample]()
+    for run, each in enumerate(values):
+        resting = not (start.force[run] or start.rest_command[run] or start.reference[run])
+        wanted.append(offset[run, 0] + per_force * given)
+        steps = list[PlanSample]()
+        played = run_plan(
+            plan,
+            rig.plant,
+            each,
+            wanted[-1],
+            steps,
+            start=None if resting else rest_plan(plan, rig.plant, each, start, run),
+            sensors=rig.sensors,
+            command_step=rig.command_step,
+            seed=seed,
+            start_state=start.state.x[run],
+            start_command=float(start.rest_command[run]),
+            sticks=scenario.friction == "sticking" and can_stick(rig.plant),
+        )
+        runs.append(played)
+        ended.append(steps[-1])
+    outputs = {name: np.stack([run.outputs[name] for run in runs]) for name in names}
+    reference = np.stack(wanted)
+    if outer is not None:
+        reference = outer.ask(reference, outputs.get(outer.position, np.zeros_like(reference)))
+    return Playback(
+        time=runs[0].time,
+        reference=reference,
+        current=np.stack([run.current for run in runs]),
+        outputs=outputs,
+        peaks={name: np.array([run.peaks[name] for run in runs]) for name in names},
+        equilibrium=start,
+        edges=tuple(int(edge) for edge in np.cumsum([0, *(part.size for part in parts)])),
+        contacts=(),
+        faulted=np.array([step.faulted for step in ended]),
+        error=max(run.error for run in runs),
+        command=runs[0].command,
+        substeps=max(run.substeps for run in runs),
+        wall_s=time.perf_counter() - began,
+    )
+
+
+def run_plan(
+    plan: ForceMPC,
+    plant: Plant,
+    values: ParameterSet,
+    reference: Signal,
+    steps: list[PlanSample],
+    *,
+    start: MPCState | None = None,
+    **options: Any,
+) -> ForceRun:
+    """Return the samples of a run, and add each step of the plan to `steps`; `options` are those of `close_loop`. An
+    outer loop is given what it makes the reference of, an x_0 or a force, and asks for the force of one sample.
+    """
+    outer, reads = plan.outer, plan.reads
+    step, named = make_stepper(plan, start), (*reads, *(() if outer is None else (outer.position,)))
+    moved = tuple(dict.fromkeys(name for name in named if name in plant.outputs))
+
+    def law(state: Any, r: Any, y: Any) -> tuple[float, Any]:
+        kept, (force, *positions) = state, np.ravel(y).tolist()
+        places = dict(zip(moved, positions, strict=True))
+        if outer is not None:
+            x_0, besides = outer.split(r / outer.per_given)
+            kept = follow_link(outer.numbers, kept, x_0, places.get(outer.position, 0.0))
+            r = besides + kept[-1]
+        steps.append(step(r, force, [places.get(name, 0.0) for name in reads]))
+        return steps[-1].command, kept
+
+    return close_loop(
+        law,
+        FIRST,
+        plant,
+        values,
+        reference,
+        measured=(plan.measured, *moved),
+        sample_time_s=plan.sample_time_s,
+        delay_samples=plan.compute_delay_samples,
+        command_limit=plan.command_limit,
+        **options,
+    )
+
+
+def rest_plan(plan: ForceMPC, plant: Plant, values: ParameterSet, start: Equilibrium, run: int) -> MPCState:
+    """Return the state of a plan that rests with its plant: the estimate is that of the force, whose drift is what the
+    command does not explain.
+    """
+    force, current, x = float(start.force[run]), float(start.rest_command[run]), start.state.x[run]
+    inputs = np.append(current, np.zeros(len(plant.inputs) - 1))
+    read = output_function(plant)(0.0, x, inputs, plant.complete(values).vector)
+    outputs = dict(zip(plant.outputs, np.ravel(np.array(read)).tolist(), strict=True))
+    readings = [outputs.get(name, 0.0) for name in plan.reads]
+    reference = np.array([float(start.reference[run])])
+    terms = add_terms(plan.compensation, plan.link_filter, plan.start.terms, reference, readings)
+    planned, kalman, low_pass = current - terms[1] * plan.per_effort, plan.kalman, plan.spec.low_pass
+    drift = (force - float(kalman.offset[0])) / plan.static_gain - planned
+    predicted, past = np.zeros(len(kalman.A)), kalman.start.past.copy()
+    predicted[: plan.rest_state.size], predicted[-1] = plan.rest_state * (planned + drift), drift
+    past[:, 0] = planned
+    return replace(
+        plan.start,
+        kalman=replace(kalman.start, predicted=predicted, corrected=predicted, past=past),
+        command=current,
+        plan=np.full(plan.start.plan.size, planned),
+        shaped=() if low_pass is None else rest_filter(low_pass, force),
+        terms=terms,
+    )
 
 
 def _start_state(rig: Rig, scenario: Scenario, values: Sequence[CompletedParameters], longest: float) -> LoopState:

@@ -255,7 +255,7 @@ class RestStart:
         `places` are for a plant that does not have the variable. Raises SimulationError: to hold it there takes
         more than the command's limit, the loop runs away, or the gate gives its sensor up.
         """
-        law, holding = self.schedule.runnable(outer=True), abs(float(self.equilibrium.current_A[0]))
+        law, holding = self.schedule.runnable(outer=True), abs(float(self.equilibrium.rest_command[0]))
         if holding > law.command_limit:
             needed, limit = (show_command(value, *law.command) for value in (holding, law.command_limit))
             raise SimulationError(

@@ -11,7 +11,7 @@ from typing import Any
 
 from seaopt.bench import Sensors
 from seaopt.codec import Key, OrInfinite, read_fields, to_content
-from seaopt.control import Controller
+from seaopt.control import Controller, ForceMPC
 from seaopt.control.laws.command import Command
 from seaopt.errors import ControlError, StepSizeError, suggestion
 from seaopt.executors import Shared, map_ordered
@@ -167,9 +167,19 @@ def _restore_settling(row: Outcome) -> Outcome:
 
 
 def make_rigs(
-    controller: Controller, plants: Plants, sensors: Sensors | None, command_step: float, partners: Plants | None = None
+    controller: Controller,
+    plants: Plants,
+    sensors: Sensors | None,
+    command_step: float,
+    partners: Plants | None = None,
+    plan: ForceMPC | None = None,
 ) -> dict[str, Rig]:
-    """Return where a controller is played: on plants as it sees them, with what holds their links."""
+    """Return where a controller is played: on plants as it sees them, with what holds their links. In place of the
+    linear region of a `plan` that runs, with its limit of the command.
+    """
+    if plan is not None:
+        limits = {"current_limit_A": plan.spec.current_limit_A, "command_limit": plan.spec.command_limit}
+        controller = replace(controller, spec=replace(controller.spec, **limits))
     seen = {name: controller.see(plant) for name, plant in plants.items()}
     return {
         name: Rig(
@@ -178,6 +188,7 @@ def make_rigs(
             partner=_partner(plant, (partners or {}).get(name)),
             sensors=sensors or Sensors(),
             command_step=command_step,
+            plan=plan,
         )
         for name, plant in seen.items()
     }
@@ -195,6 +206,7 @@ def verify(
     partners: Plants | None = None,
     seed: int = 1,
     known: Verification | None = None,
+    plan: ForceMPC | None = None,
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> Verification:
@@ -224,6 +236,8 @@ def verify(
         Seed of noise and random excitations.
     known : Verification, optional
         What was played before: a scenario that it has, on the same rig at the same draws, is not played again.
+    plan : ForceMPC, optional
+        Predictive control whose linear region (`linear_controller`) the controller is: it is played in steps.
     executor : concurrent.futures.Executor, optional
         Where scenarios are played (`seaopt.executors`); here, if left out. The outcomes are the same, bit for bit.
     progress : callable, optional
@@ -253,7 +267,8 @@ def verify(
     """
     check_plants(plants, draws or {}, partners or {})
     check_sensors(sensors, controller, plants)
-    rigs = make_rigs(controller, plants, sensors, command_step, partners)
+    rigs = make_rigs(controller, plants, sensors, command_step, partners, plan)
+    controller = next(iter(rigs.values())).controller
     sets = {name: (parameters, *(draws or {}).get(name, ())) for name in plants}
     skipped: list[tuple[str, str, str]] = []
     parts: list[tuple[str, Scenario, list[Outcome]]] = []  # with the rows that are known

@@ -26,7 +26,7 @@ from tests.control.deploy.test_schedule_export import CompiledSchedule
 from tests.schedules import tune_knee
 
 TS = 1e-3
-GATE = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=5, ramp_A_per_s=90.0)
+GATE = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=5, ramp_per_s=90.0)
 AGREEING = replace(GATE, agreement=Agreement(reads=("q", "phi"), weights=(655e3, -4e4), limit=12.0, share=0.02))
 HEAT = HeatGuard(
     a_11=0.99, a_12=0.01, a_21=0.001, a_22=0.998, b_1=0.005, b_2=0.0, resistance=0.7, slope=0.003, allowed_rise=99.0,
@@ -218,7 +218,7 @@ def test_a_schedule_takes_extreme_numbers_as_python_does(precision, compiler, tm
 
 def test_python_refuses_to_start_from_what_c_takes_as_zero(tuned):
     law = runnable(tuned)
-    for given in ({"reference": 1e308}, {"measurement": -1e300}, {"reference": np.inf}, {"current_A": np.nan}):
+    for given in ({"reference": 1e308}, {"measurement": -1e300}, {"reference": np.inf}, {"command": np.nan}):
         with pytest.raises(ControlError, match=f"{next(iter(given))} = .*give finite numbers, within"):
             law.reset(**given)
 
@@ -235,6 +235,6 @@ def test_a_plan_outlives_extreme_readings(single, mpc, compiler, tmp_path):
     for reading in readings:
         result = mpc.step(state, 500.0, reading)
         state = result.state
-        commands.append(result.current_A)
+        commands.append(result.command)
     np.testing.assert_allclose(rows[:, 0], commands, rtol=0, atol=2e-2 if single else 1e-7)
     assert rows[-1, 1] == 1 and np.all(np.isfinite(rows))

@@ -137,7 +137,7 @@ def test_the_exported_code_does_the_same(controller, compiler, tmp_path, precisi
 
 
 def test_held_readings_and_faults_heat_and_are_limited_too(controller, compiler, tmp_path):
-    gate = PlausibilityGate(range_N=(-1e3, 1e3), max_step_N=10.0, max_held=3, ramp_A_per_s=20.0)
+    gate = PlausibilityGate(range_N=(-1e3, 1e3), max_step_N=10.0, max_held=3, ramp_per_s=20.0)
     law = runnable(controller, heat=controller.heat_guard, gate=gate)
     step, struct, _ = compile_law(compiler, controller, tmp_path, gated=True, gate=gate)
     state = law.reset()

@@ -17,7 +17,7 @@ from tests.c_code import CONVERSIONS, STRICT
 
 STAND, THOR = so.plants.high_impedance(), so.plants.thor()
 SPEC = so.ControllerSpec(bandwidth_hz=25, max_sensitivity=1.6, current_limit_A=9.0)
-GATE = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=500.0, max_held=3, ramp_A_per_s=50.0)
+GATE = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=500.0, max_held=3, ramp_per_s=50.0)
 READING, COMMAND = 300.0, 1.25
 
 

@@ -230,7 +230,7 @@ def test_a_controller_json_gives_the_same_files(tuned, tmp_path):
 
 
 def test_a_gate_answers_by_status_and_begins_at_zero_where_a_reset_cannot_be_believed(compiler, tuned, tmp_path):
-    gate = PlausibilityGate(range_N=(-800.0, 800.0), max_step_N=36.638953, max_held=3, ramp_A_per_s=90.0)
+    gate = PlausibilityGate(range_N=(-800.0, 800.0), max_step_N=36.638953, max_held=3, ramp_per_s=90.0)
     law = CompiledLaw(compiler, tmp_path, tuned, "double", gate=gate)
     header = (tmp_path / "law.h").read_text()
     assert "answers in `status`, not in `held`" in header and "36.639\n" in header

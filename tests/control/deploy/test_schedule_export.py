@@ -94,7 +94,7 @@ def test_a_limit_above_that_of_the_design_is_stated(tmp_path, schedule, limit, s
     assert ("It was designed with a limit of 5 A" in (tmp_path / "force_law.h").read_text()) == stated
 
 
-GATE = PlausibilityGate(range_N=(-8.0, 8.0), max_step_N=9.0, max_held=6, ramp_A_per_s=20.0)
+GATE = PlausibilityGate(range_N=(-8.0, 8.0), max_step_N=9.0, max_held=6, ramp_per_s=20.0)
 HEAT = HeatGuard(
     a_11=0.985, a_12=0.01, a_21=0.001, a_22=0.9989, b_1=0.08, b_2=1e-4, resistance=0.6, slope=0.002,
     allowed_rise=40.0, share=0.02, ambient=21.0,

@@ -206,7 +206,7 @@ def test_accept_takes_the_file_as_it_is_and_names_another_law(whole, tuned, tmp_
     log = so.read_log(path)
     assert log.law == hash_law(runnable(tuned))
     assert so.accept(tuned, [log]).replays[0].met
-    gated = replace(tuned, gate=PlausibilityGate(range_N=(-9e3, 9e3), max_step_N=9e3, max_held=5, ramp_A_per_s=90.0))
+    gated = replace(tuned, gate=PlausibilityGate(range_N=(-9e3, 9e3), max_step_N=9e3, max_held=5, ramp_per_s=90.0))
     said = so.accept(gated, [log])  # which would have made these commands, too
     assert not said.replays[0].met and "law by the log's header is another" in str(said)
     said = so.accept(gated, [log], others={"old/controller.json": tuned})
@@ -218,7 +218,7 @@ def test_the_hash_is_of_what_the_law_does(tuned, stand, thor):
     own = hash_law(runnable(tuned))
     assert hash_law(runnable(again)) == own and len(own) == 16
     agreement = Agreement(reads=("q",), weights=(655e3,), limit=12.0, share=0.02)
-    gate = PlausibilityGate(range_N=(-9e3, 9e3), max_step_N=9e3, max_held=5, ramp_A_per_s=90.0, agreement=agreement)
+    gate = PlausibilityGate(range_N=(-9e3, 9e3), max_step_N=9e3, max_held=5, ramp_per_s=90.0, agreement=agreement)
     law = runnable(tuned)
     heat = HeatGuard(**HOT, resistance=0.6, slope=0.002, allowed_rise=80.0, share=0.02, ambient=21.0)
     others = [
@@ -239,7 +239,7 @@ def test_the_hash_is_of_what_the_law_does(tuned, stand, thor):
 
 def test_encoders_and_their_units_are_channels(compiler, tuned, tmp_path):
     agreement = Agreement(reads=("q",), weights=(655e3,), limit=12.0, share=0.02, units=("m",))
-    gate = PlausibilityGate(range_N=(-9e3, 9e3), max_step_N=9e3, max_held=5, ramp_A_per_s=90.0, agreement=agreement)
+    gate = PlausibilityGate(range_N=(-9e3, 9e3), max_step_N=9e3, max_held=5, ramp_per_s=90.0, agreement=agreement)
     content = json.loads(to_json(replace(tuned, gate=gate).to_dict()))  # no design plant that tells units
     log = CompiledLog(compiler, tmp_path, content, 4)
     stated = json.loads(log.header.removeprefix(b"SEALOG1"))

@@ -24,7 +24,7 @@ STATUS = ("ok", "held", "fault")
 
 def make_gate(agreement, max_held=5):
     return PlausibilityGate(
-        range_N=(-4000.0, 4000.0), max_step_N=400.0, max_held=max_held, ramp_A_per_s=90.0, agreement=agreement
+        range_N=(-4000.0, 4000.0), max_step_N=400.0, max_held=max_held, ramp_per_s=90.0, agreement=agreement
     )
 
 

@@ -14,7 +14,7 @@ from seaopt.errors import ControlError
 from tests.c_code import CompiledLaw, CompiledMPC
 
 TS, BEGIN = 1e-3, 300
-GATE = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=50, ramp_A_per_s=90.0)
+GATE = PlausibilityGate(range_N=(-4000.0, 4000.0), max_step_N=300.0, max_held=50, ramp_per_s=90.0)
 STATUS = ("ok", "held", "fault")
 REFERENCE = np.repeat([500.0, 600.0], [450, 300])
 FIRST = [np.nan, 1e4, -np.inf, 3000.0, 10.0, 20.0]  # no number, out of range twice, in range and wrong, true
@@ -56,7 +56,7 @@ def of_law(law):
 def of_mpc(mpc):
     def step(state, reference, reading):
         result = mpc.step(state, reference, reading)
-        return result.current_A, result.state, result.state.gate.status
+        return result.command, result.state, result.state.gate.status
 
     return step, mpc.start
 
@@ -81,7 +81,7 @@ def check(found, clean, name):
     assert set(statuses[first:]) == {"fault"}  # the sensor is back, and not trusted
     falling = np.abs(currents[first - 1 :])
     assert np.all(np.diff(falling) <= 0.0)
-    np.testing.assert_allclose(-np.diff(falling)[:5], GATE.ramp_A_per_s * TS, rtol=1e-9)
+    np.testing.assert_allclose(-np.diff(falling)[:5], GATE.ramp_per_s * TS, rtol=1e-9)
     assert currents[-1] == 0.0 and abs(forces[-1]) < 1.0
 
 
@@ -223,7 +223,7 @@ def test_the_c_code_starts_as_python_does(precision, given, compiler, tuned, tmp
     [
         ("range_N", [(1.0, -1.0), (1.0, 1.0), (np.nan, 1.0), (-np.inf, 1.0), (0.0, np.inf), (0.0, 1e300)]),
         ("max_step_N", [0.0, -1.0, np.inf, np.nan, 1e300, 1e-300]),
-        ("ramp_A_per_s", [0.0, -1.0, np.inf, np.nan]),
+        ("ramp_per_s", [0.0, -1.0, np.inf, np.nan]),
         ("max_held", [-1, 10**9]),
     ],
 )  # fmt: skip

@@ -268,12 +268,12 @@ def test_a_saturating_step_overshoots_less_with_anti_windup(k_i, tuned):
 
 def test_reset_continues_from_a_current(tuned):
     law = runnable(tuned)
-    state = law.reset(reference=700.0, measurement=700.0, current_A=2.5)
+    state = law.reset(reference=700.0, measurement=700.0, command=2.5)
     current, after = law.step(state, 700.0, 700.0)
     assert current == pytest.approx(2.5, rel=1e-12)
     np.testing.assert_allclose(after.x, state.x, rtol=1e-9)
     with pytest.raises(ControlError, match="above the limit of 9 A"):
-        law.reset(current_A=10.0)
+        law.reset(command=10.0)
     with pytest.raises(ControlError, match="give finite numbers"):
         law.reset(measurement=np.nan)
 

@@ -60,8 +60,8 @@ def run(mpc, plant, references, injected=None):
         result = mpc.step(state, float(reference), force)
         state = result.state
         errors.append(float(state.kalman.innovation[0]))
-        commands.append(result.current_A)
-        plant.step(k, result.current_A)
+        commands.append(result.command)
+        plant.step(k, result.command)
     return np.array(forces), np.array(commands), np.array(errors)
 
 
@@ -144,7 +144,7 @@ def test_bounds_of_signals_are_kept_with_a_late_drive(made, stand, thor):
     for k in range(160):
         result = mpc.step(state, 1500.0 if k > 10 else 0.0, plant.force)
         state = result.state
-        plant.step(k, result.current_A)
+        plant.step(k, result.command)
         speeds.append(plant.x[1])
     assert 0.07 < np.max(np.abs(speeds)) < 0.08 * 1.02
 

@@ -18,7 +18,7 @@ from seaopt.files import to_json
 from tests.c_code import STRICT, CompiledMPC
 from tests.control.deploy.test_derating import HEAT, LIMIT_A, warm
 
-GATE = PlausibilityGate(range_N=(-300.0, 300.0), max_step_N=60.0, max_held=4, ramp_A_per_s=300.0)
+GATE = PlausibilityGate(range_N=(-300.0, 300.0), max_step_N=60.0, max_held=4, ramp_per_s=300.0)
 PLANT = so.plants.rotary(link="locked", parts=["thermal"])
 VALUES = PLANT.defaults.update(**HEAT)
 
@@ -95,7 +95,7 @@ def test_a_winding_under_full_command_stays_below_its_largest_temperature_and_th
         result = mpc.step(state, 10.0 * abs(mpc.static_gain) * LIMIT_A, 0.0)
         state = result.state
         assert result.solved
-        commands.append(result.current_A)
+        commands.append(result.command)
         rises.append(state.heat[0])
     assert max(rises) <= HEAT["T_max"] - HEAT["T_ambient"]
     assert commands[-1] < 0.5 * LIMIT_A < commands[100]

@@ -19,7 +19,7 @@ from seaopt.errors import ControlError, SeaoptError
 from seaopt.files import to_json
 from seaopt.problem.stages import design_mpc, tune_problem
 from seaopt.robustness import feed_link_forward, linear_controller
-from seaopt.robustness.certificate import constrained
+from seaopt.robustness.verification import playback
 from tests.control.mpc.test_terms import FROM_SPEED, GATE, GRAVITY, LIMIT_A, TS, WEIGHT, draw_rows, run_c
 from tests.control.mpc.test_terms import read as read_file
 
@@ -118,8 +118,8 @@ def test_the_loop_that_the_link_closes_is_certified_and_played(fraction, slow, t
     """Without a high-pass more than all of the drive's effort swings the pendulum up."""
     asked = f"link_feedforward = {{ fraction = {fraction}, high_pass_hz = {slow} }}\n"
     problem = read(tmp_path, asked, f_c=0)
-    mpc, runs, play = design_mpc(problem, problem.parameters), [], constrained.close_loop
-    monkeypatch.setattr(constrained, "close_loop", lambda *a, **k: runs.append(play(*a, **k)) or runs[-1])
+    mpc, runs, play = design_mpc(problem, problem.parameters), [], playback.close_loop
+    monkeypatch.setattr(playback, "close_loop", lambda *a, **k: runs.append(play(*a, **k)) or runs[-1])
     certificate = so.certify(mpc, problem.certified_plants(), problem.parameters, samples=3, runs=1)
     (row,) = (row for row in certificate.requirements if row.name == "spectral_radius" and row.plant == "swing")
     assert row.value == pytest.approx(find_radius(mpc, fraction, slow), abs=1e-7)

@@ -76,7 +76,7 @@ def exact(mpc, x0, u_last, reference, drift, samples):
     cost += ca.bilin(ca.DM(mpc.regulator.Pi), end, end)
     options = {"printLevel": "none", "print_time": False}
     solver = ca.qpsol("exact", "qpoases", {"x": u, "f": cost, "g": ca.vertcat(*slopes)}, options)
-    slew = mpc.spec.slew_per_sample_A
+    slew = mpc.spec.slew_per_sample
     found = solver(lbx=-9, ubx=9, lbg=-slew, ubg=slew, x0=u_last)
     return float(found["x"][0])
 
@@ -91,12 +91,12 @@ def test_with_limits_it_is_what_another_solver_finds(stand, thor, slew):
         x0 = np.array([rng.uniform(-2000, 2000) / thor["k"].value, rng.uniform(-0.05, 0.05)])
         drift, last, reference = rng.uniform(-0.5, 0.5), rng.uniform(-9, 9), rng.uniform(-2500, 2500)
         z = np.concatenate([x0, [0.0, drift]])
-        state = replace(mpc.start, current_A=last, kalman=replace(mpc.kalman.start, predicted=z))
+        state = replace(mpc.start, command=last, kalman=replace(mpc.kalman.start, predicted=z))
         step = mpc.step(state, reference, float(mpc.kalman.C[0] @ z))
         assert step.solved
         best = exact(mpc, x0, last, reference, drift, 30)
-        assert step.current_A == pytest.approx(best, abs=1e-8)
-        at_limit += abs(abs(best - last) - mpc.spec.slew_per_sample_A) < 1e-6 or abs(best) > 9 - 1e-6
+        assert step.command == pytest.approx(best, abs=1e-8)
+        at_limit += abs(abs(best - last) - mpc.spec.slew_per_sample) < 1e-6 or abs(best) > 9 - 1e-6
     assert 5 < at_limit < 25
 
 
@@ -149,9 +149,9 @@ def test_limits_are_never_broken(stand, thor, slew):
         measurement = np.nan if k % 50 == 7 else rng.normal() * (1e5 if k % 101 == 5 else 500.0)
         step = mpc.step(state, reference, measurement)
         state, solved = step.state, solved + step.solved
-        currents.append(step.current_A)
+        currents.append(step.command)
     assert np.max(np.abs(currents)) <= 9.0
-    assert np.max(np.abs(np.diff(currents))) <= mpc.spec.slew_per_sample_A * (1 + 1e-12)
+    assert np.max(np.abs(np.diff(currents))) <= mpc.spec.slew_per_sample * (1 + 1e-12)
     assert solved == 300
 
 
@@ -159,7 +159,7 @@ def test_limits_are_never_broken(stand, thor, slew):
 @pytest.mark.parametrize(("torque", "inertia"), [(0.9, 1.0), (1.1, 1.1)])
 def test_no_offset_is_left_on_a_plant_it_was_not_made_for(stand, thor, mpc, torque, inertia):
     real = thor.update(K_tau=thor["K_tau"].value * torque, J=thor["J"].value * inertia)
-    run = close_loop(mpc.command, mpc.start, stand, real, np.full(2000, 1000.0), disturbance_A=-0.5)
+    run = close_loop(mpc.command, mpc.start, stand, real, np.full(2000, 1000.0), disturbance=-0.5)
     assert run.force[-1] == pytest.approx(1000.0, abs=1.5)
 
 
@@ -196,9 +196,9 @@ def test_a_solver_that_fails_leaves_the_safe_current(mpc, monkeypatch, status, x
     step = mpc.step(mpc.start, 1000.0, 0.0)
     assert not step.solved
     assert said in step.status
-    assert step.current_A == 2.0  # towards 1000 N / 240 N/A as fast as 2000 A/s let it
-    after = mpc.step(replace(step.state, current_A=4.0), 1000.0, 0.0)
-    assert after.current_A == pytest.approx(1000.0 / mpc.static_gain, abs=0.5)
+    assert step.command == 2.0  # towards 1000 N / 240 N/A as fast as 2000 A/s let it
+    after = mpc.step(replace(step.state, command=4.0), 1000.0, 0.0)
+    assert after.command == pytest.approx(1000.0 / mpc.static_gain, abs=0.5)
 
 
 def test_a_step_is_a_function_of_its_arguments(stand, thor, mpc):
@@ -207,7 +207,7 @@ def test_a_step_is_a_function_of_its_arguments(stand, thor, mpc):
     state = mpc.start
     for k in range(40):
         state = mpc.step(state, 2000.0 * (-1.0) ** (k // 7), 100.0 * k).state
-    assert mpc.step(mpc.start, 1500.0, 3.0).current_A == first.current_A
+    assert mpc.step(mpc.start, 1500.0, 3.0).command == first.command
 
 
 def test_a_reference_that_is_no_number_is_refused(mpc):

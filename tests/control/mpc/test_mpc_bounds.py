@@ -32,7 +32,7 @@ def run_on(mpc, plant, params, reference, **options):
 
     def law(state, r, y):
         steps.append(mpc.step(state, r, y))
-        return steps[-1].current_A, steps[-1].state
+        return steps[-1].command, steps[-1].state
 
     return close_loop(law, mpc.start, plant, params, reference, **options), steps
 
@@ -88,10 +88,10 @@ def test_it_is_what_another_solver_finds_with_hard_bounds(stand, thor, bounds, a
         if best is None:
             continue
         z = np.concatenate([x0, [0.0, 0.0]])
-        state = replace(mpc.start, current_A=last, kalman=replace(mpc.kalman.start, predicted=z))
+        state = replace(mpc.start, command=last, kalman=replace(mpc.kalman.start, predicted=z))
         step = mpc.step(state, references, float(mpc.kalman.C[0] @ z))
         assert step.solved and step.slack < 2e-3
-        assert step.current_A == pytest.approx(best, abs=2e-2)
+        assert step.command == pytest.approx(best, abs=2e-2)
         loose = exact(mpc, x0, last, references, {})
         solved, active = solved + 1, active + (abs(loose - best) > 0.05)
     assert solved >= 4
@@ -136,7 +136,7 @@ def test_a_speed_that_is_there_already_is_broken_as_little_as_can_be(stand, thor
     state = replace(mpc.start, kalman=replace(mpc.kalman.start, predicted=z))
     step = mpc.step(state, 1000.0, 0.0)
     assert step.solved and step.slack > 0.5
-    assert step.current_A == pytest.approx(-2.0, abs=1e-9)  # brakes as hard as 2000 A/s let it
+    assert step.command == pytest.approx(-2.0, abs=1e-9)  # brakes as hard as 2000 A/s let it
 
 
 @pytest.mark.slow
@@ -175,7 +175,7 @@ def test_a_reference_known_for_the_delay_alone_is_one_that_comes_so_much_earlier
 def test_a_reference_that_stays_is_no_other_with_preview(stand, thor):
     one, other = made(stand, thor), made(stand, thor, preview_samples=30)
     for references in (700.0, np.full(31, 700.0), np.full(4, 700.0)):
-        assert other.step(other.start, references, 3.0).current_A == one.step(one.start, 700.0, 3.0).current_A
+        assert other.step(other.start, references, 3.0).command == one.step(one.start, 700.0, 3.0).command
 
 
 def test_without_a_solution_the_last_plan_goes_on_and_after_a_horizon_the_current_of_rest(stand, thor, monkeypatch):
@@ -191,7 +191,7 @@ def test_without_a_solution_the_last_plan_goes_on_and_after_a_horizon_the_curren
     for _ in range(mpc.spec.samples + 1):
         step = mpc.step(step.state, 1000.0, np.nan)
         assert not step.solved and "breaks a limit" in step.status
-        currents.append(step.current_A)
+        currents.append(step.command)
     planned = np.interp(np.arange(1, 9), knots, good.state.plan)
     assert currents[:3] == pytest.approx(planned[:3], abs=1e-9)  # the first knots are a sample apart
     assert currents[-1] == pytest.approx(1000.0 / mpc.static_gain, abs=2.0)
@@ -209,7 +209,7 @@ def test_the_c_code_does_the_same_with_bounds_and_preview_and_where_iterations_d
     def law(state, r, y):
         measurements.append(y)
         steps.append(mpc.step(state, r, y))
-        return steps[-1].current_A, steps[-1].state
+        return steps[-1].command, steps[-1].state
 
     run = close_loop(law, mpc.start, stand, thor, reference, preview_samples=ahead, sensors=SENSOR)
     padded = np.append(reference, np.full(ahead, reference[-1]))

@@ -11,7 +11,7 @@ import seaopt as so
 from seaopt.control.laws.realisation import realise, runnable
 from seaopt.control.running.closed_loop import LoopState, SampledLoop, at_rest, run_loop
 from seaopt.control.running.force_run import close_loop
-from seaopt.control.running.sampled_loop import largest_current
+from seaopt.control.running.sampled_loop import largest_command
 from seaopt.errors import SimulationError
 from seaopt.simulation import native
 from tests.laws import law_of, scaled
@@ -316,9 +316,9 @@ def test_bad_runs(stand, thor):
             run_loop(loop, **{"params": [thor], "reference": np.ones(5), **options})
 
 
-def test_the_largest_current_is_a_whole_step():
-    assert largest_current(9.0, 0.07) == pytest.approx(8.96)
-    assert largest_current(9.0, 0.0) == 9.0
+def test_the_largest_command_is_a_whole_step():
+    assert largest_command(9.0, 0.07) == pytest.approx(8.96)
+    assert largest_command(9.0, 0.0) == 9.0
 
 
 def test_a_motor_that_friction_holds_against_its_cogging_stands_still():

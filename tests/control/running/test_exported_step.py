@@ -117,7 +117,7 @@ def draw_guards(shape, rng):
     reads = ("q", "x")[: shape.integers(1, 3)]
     agreement = Agreement(reads=reads, weights=(300.0, -200.0)[: len(reads)], limit=250.0, share=0.1)
     gate = PlausibilityGate(
-        range_N=(-2e3, 2e3), max_step_N=300.0, max_held=int(rng.integers(0, 7)), ramp_A_per_s=90.0,
+        range_N=(-2e3, 2e3), max_step_N=300.0, max_held=int(rng.integers(0, 7)), ramp_per_s=90.0,
         agreement=agreement if shape.random() < 0.5 else None,
     )  # fmt: skip
     heat = HeatGuard(**HOT, resistance=0.6, slope=0.002, allowed_rise=rng.uniform(20, 90), share=0.02, ambient=21.0)

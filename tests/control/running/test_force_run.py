@@ -22,7 +22,7 @@ def proportional(state, reference, measurement):
 def test_the_plant_is_dop853s_however_sharp_its_friction(swing, thor, friction, v_s):
     params = thor.update(f_c=friction, v_s=v_s, d=0.05)
     reference = np.where(np.arange(300) < 100, 60.0, -30.0)
-    run = close_loop(proportional, None, swing, delayed(params, 0.4e-3), reference, disturbance_A=0.05)
+    run = close_loop(proportional, None, swing, delayed(params, 0.4e-3), reference, disturbance=0.05)
     rate, force = swing_by_hand(params)
     x, waiting, forces, states = np.zeros(4), [0.0, 0.0], [], []
     for k in range(300):
@@ -51,6 +51,22 @@ def test_the_exported_law_runs_here_as_there(swing, thor, delay_s):
     other = run_loop(loop, [params], reference)
     np.testing.assert_allclose(one.force, other.outputs["F1"][0], atol=1e-3)
     assert np.max(np.abs(one.current)) == 3.0
+
+
+def test_friction_sticks_here_as_there_and_peaks_are_between_the_samples_too(stand, thor):
+    """The limit slides the drive until spring and friction hold it."""
+    runnable, params = law(0.15), stand.complete(thor.update(f_c=20.0))
+    reference = np.where(np.arange(300) < 150, 80.0, -80.0)
+    one = close_loop(runnable.step, runnable.reset(), stand, params, reference, sticks=True)
+    loop = SampledLoop(plant=stand, law=runnable, measured="F1", delay_samples=1, sticks=True)
+    other = run_loop(loop, [params], reference)
+    still = np.diff(one.state[:, list(stand.states).index("q")]) == 0.0
+    assert 10 < np.count_nonzero(still) < 290
+    np.testing.assert_allclose(one.force, other.outputs["F1"][0], atol=1e-2)
+    assert one.peaks.keys() == other.peaks.keys() and "energy" in one.outputs
+    for name, peak in one.peaks.items():
+        assert peak == pytest.approx(float(other.peaks[name][0]), rel=1e-3)
+        assert peak >= np.max(np.abs(one.outputs[name]))
 
 
 def test_sensors_and_amplifier_err_here_as_there(thor):

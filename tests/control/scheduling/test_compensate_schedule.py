@@ -77,7 +77,7 @@ def test_the_terms_are_those_of_the_load_at_its_place(schedule, plain):
         np.testing.assert_allclose([term.effort(x) for x in angles], expected, atol=2e-5 * load * G * L)
     bare, full, rng = plain.runnable(limit=np.inf), schedule.runnable(limit=np.inf), np.random.default_rng(5)
     terms = [each.compensation.gravity.coefficients for each in schedule.controllers]
-    one, other, before = bare.reset(place=2.0, current_A=-0.05), full.reset(place=2.0), None
+    one, other, before = bare.reset(place=2.0, command=-0.05), full.reset(place=2.0), None
     friction = 0.4 * N * F_C
     for k in range(600):
         load, (r, y) = 5.0 - 3.0 * math.cos(k / 90.0), 0.1 * rng.normal(size=2)

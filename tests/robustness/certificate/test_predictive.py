@@ -11,14 +11,26 @@ import pytest
 from scipy.signal import cont2discrete
 
 import seaopt as so
-from seaopt.control import Impedance, MPCSpec, NoiseModel, add_impedance, close_loop, force_mpc, runnable
+from seaopt.control import (
+    Impedance,
+    LinkFeedforward,
+    MPCSpec,
+    NoiseModel,
+    add_impedance,
+    close_loop,
+    force_mpc,
+    runnable,
+)
 from seaopt.errors import ControlError
 from seaopt.files import to_json
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
-from seaopt.robustness import linear_controller
+from seaopt.robustness import Phase, Scenario, feed_link_forward, linear_controller
 from seaopt.robustness.certificate import constrained
 from seaopt.robustness.certificate.linear_region import sweep_plans
+from seaopt.robustness.verification import playback
+from seaopt.robustness.verification.playback import play
+from seaopt.robustness.verification.verification import make_rigs
 
 TS = 1e-3
 SPEED_LIMIT = {"qd": (-0.08, 0.08)}
@@ -221,8 +233,53 @@ def test_of_friction_no_sensors_are_asked_for_that_no_step_would_have(stand, tho
 
 def test_it_comes_back_from_its_file(certificate, mpc, stand, thor):
     content = json.loads(to_json(certificate.to_dict()))
-    again = so.Certificate.from_dict(content, certificate.controller, {"stand": stand}, thor)
+    again = so.Certificate.from_dict(content, certificate.controller, {"stand": stand}, thor, plan=mpc)
     assert again.constrained == certificate.constrained and again.passed
+    (row,) = (row for row in again.steps.rows if (row.scenario, row.draw) == ("50 % step", "nominal"))
+    assert np.max(np.abs(again.steps.replay(row).current)) == row.peak_command
+
+
+def test_steps_are_played_as_exported(certificate, mpc, stand, thor):
+    """Each command is that of the plan's own step; of the largest its rate is at the slew limit, which no law of the
+    linear region keeps.
+    """
+    rows = {row.scenario: row for row in certificate.steps.rows if row.draw == "nominal"}
+    assert list(rows) == ["2 % step", "10 % step", "50 % step", "unsaturated step"]
+    played = certificate.steps.replay(rows["50 % step"])
+    state, currents = mpc.start, []
+    for wanted, force in zip(played.reference[0], played.outputs["F1"][0], strict=True):
+        current, state = mpc.command(state, wanted, force)
+        currents.append(current)
+    np.testing.assert_allclose(played.current[0], currents, atol=1e-9)
+    slews = np.abs(np.diff(currents))
+    assert np.max(slews) == pytest.approx(2000.0 * TS) and np.count_nonzero(slews > 1.99) > 1
+    assert played.reference[0, -1] == pytest.approx(0.5 * 9.0 * abs(mpc.static_gain))
+    alone = linear_controller(mpc)
+    assert np.max(np.abs(runnable(alone).step(runnable(alone).reset(), played.reference[0, -1], 0.0)[0])) > 2.0
+
+
+def test_steps_are_of_what_bounds_let_the_plan_hold(stand, thor):
+    """800 N of 1,442 N that the limit of the command holds."""
+    bound = 800.0 / thor["k"].value
+    spec = MPCSpec(current_limit_A=9.0, bandwidth_hz=20.0, bounds={"spring_deflection": (-bound, bound)})
+    steps = so.certify(force_mpc(stand, thor, spec), {"stand": stand}, thor, samples=1, runs=1).steps
+    (row,) = (row for row in steps.rows if (row.scenario, row.draw) == ("50 % step", "nominal"))
+    assert steps.met and steps.replay(row).reference[0, -1] == pytest.approx(400.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("prefilter", [None, "second_order"])
+def test_a_plan_rests_where_a_step_begins(stand, swing, thor, prefilter):
+    """At an angle the spring carries a part of the link's weight, and nothing moves, the link fed forward or not."""
+    mpc = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=20.0, prefilter=prefilter))
+    for plan in (mpc, feed_link_forward(mpc, LinkFeedforward(), {"swing": (swing, thor)})):
+        placed = thor.with_parameters(so.Parameter(name="phi", value=0.4, unit="rad"))
+        (rig,) = make_rigs(linear_controller(plan), {"swing": swing}, None, 0.0, plan=plan).values()
+        still = play(rig, Scenario(name="rest", phases=(Phase(duration_s=0.3),)), [placed])
+        force, angle = still.outputs["F1"][0], still.outputs["phi"][0]
+        weight = thor["m"].value * 9.81 * thor["L"].value * np.tan(0.4) / thor["L_a"].value
+        assert abs(force[0]) == pytest.approx(weight, rel=1e-6)
+        np.testing.assert_allclose(force, force[0], atol=1e-3)
+        np.testing.assert_allclose(angle, 0.4, atol=1e-6)
 
 
 def test_what_cannot_be_is_said_in_one_line(certificate, mpc, stand, thor):
@@ -241,11 +298,11 @@ def test_runs_with_limits_active_have_the_outer_loop(monkeypatch, stiffness):
     mpc = force_mpc(held, values, MPCSpec(measured="tau_s", current_limit_A=8.0, bandwidth_hz=12, preview_samples=5))
     asked = Impedance(stiffness=stiffness, damping=2.0, velocity_filter_s=5e-3)
     mpc = replace(mpc, outer=add_impedance(linear_controller(mpc), free, values, asked, name="free").outer)
-    runs, play = [], constrained.close_loop
-    monkeypatch.setattr(constrained, "close_loop", lambda *a, **k: runs.append(play(*a, **k)) or runs[-1])
+    runs, play = [], playback.close_loop
+    monkeypatch.setattr(playback, "close_loop", lambda *a, **k: runs.append(play(*a, **k)) or runs[-1])
     checked = so.certify(mpc, {"free": free}, values, samples=2, runs=1)
     assert checked.constrained.failures == 0
-    run = next(run for run in runs if run.state.shape[1] == len(free.states))
+    run = [run for run in runs if run.state.shape[1] == len(free.states)][-1]  # steps are played before
     places = run.state[:, list(free.states).index("theta_l")]
     assert np.ptp(places) > 0.1
     state, before, speed = mpc.start, places[0], 0.0

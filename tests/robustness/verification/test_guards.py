@@ -19,7 +19,7 @@ STEP = Scenario(name="step", phases=(Phase(duration_s=0.1), Phase(duration_s=0.4
 
 
 def gated(controller, largest_step):
-    gate = PlausibilityGate(range_N=(-4e3, 4e3), max_step_N=largest_step, max_held=3, ramp_A_per_s=90.0)
+    gate = PlausibilityGate(range_N=(-4e3, 4e3), max_step_N=largest_step, max_held=3, ramp_per_s=90.0)
     return replace(controller, gate=gate)
 
 

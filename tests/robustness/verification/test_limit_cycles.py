@@ -199,7 +199,7 @@ def test_a_gate_that_gives_its_sensor_up_does_not_end_a_cycle(blind, stand, rubb
     law = scaled(blind, 1.5, current_limit_A=9.0)
     (found,) = seek_limit_cycles(law, stand, rubbing)
     half = 0.5 * found.predicted.force_N
-    gate = PlausibilityGate(range_N=(-half, half), max_step_N=1e4, max_held=5, ramp_A_per_s=90.0)
+    gate = PlausibilityGate(range_N=(-half, half), max_step_N=1e4, max_held=5, ramp_per_s=90.0)
     (gated,) = seek_limit_cycles(replace(law, gate=gate), stand, rubbing)
     assert found.lasts
     assert gated.simulated == found.simulated

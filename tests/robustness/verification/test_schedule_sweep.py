@@ -80,7 +80,7 @@ def test_a_sweep_that_is_too_fast_does_not_keep_the_judgement():
 
 def test_a_gate_that_gives_its_sensor_up_is_named_in_sweeps_and_pushes():
     schedule, (_, swing, values) = tune_knee(), read_knee()
-    gate = PlausibilityGate(range_N=(-4e3, 4e3), max_step_N=1e-6, max_held=1, ramp_A_per_s=90.0)
+    gate = PlausibilityGate(range_N=(-4e3, 4e3), max_step_N=1e-6, max_held=1, ramp_per_s=90.0)
     gated = replace(schedule, controllers=tuple(replace(each, gate=gate) for each in schedule.controllers))
     (sweep,) = sweep_schedule(gated, "swing", swing, values)
     motion = move_schedule(gated, "swing", swing, values, 1.0)

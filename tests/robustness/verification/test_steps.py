@@ -97,7 +97,7 @@ def test_a_sample_at_the_limit_excuses_no_overshoot(blind, certificate, stand, r
     """One sample of the step saturates, by a hundredth of its current: it overshoots as it does without the limit."""
     rows = certificate.steps
     row = next(row for row in rows.rows if row.scenario == "unsaturated step")
-    tight = replace(blind, spec=replace(SPEC, current_limit_A=0.99 * row.peak_current_A))
+    tight = replace(blind, spec=replace(SPEC, current_limit_A=0.99 * row.peak_command))
     found = verify(tight, {"stand": stand}, rubbing, scenarios=(rows.scenario(row),)).rows[0]
     assert 0.0 < found.saturated < 0.002
     assert [fault.kind for fault in found.faults] == ["overshoot"] and not found.overshoot_by_limit

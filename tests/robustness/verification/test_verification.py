@@ -73,7 +73,7 @@ def test_scenarios_do_what_they_say(verification):
     for name in ("stand", "swing"):
         assert rows[name, "unsaturated step"].saturated == 0.0
         assert rows[name, "saturating doublet"].saturated > 0.0
-        assert rows[name, "saturating doublet"].peak_current_A == pytest.approx(9.0)
+        assert rows[name, "saturating doublet"].peak_command == pytest.approx(9.0)
     assert rows["stand", "saturating hold"].saturated > 0.1
     fall = verification.replay(rows["swing", "fall through 90 deg"])
     phi = fall.outputs["phi"][0]

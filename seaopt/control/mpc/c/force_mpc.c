@@ -276,6 +276,7 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
     rest = clip(asked / mpc_static_gain - drift, least, most);
     target[i] = mpc_static_gain * (rest + drift);
   }
+  s->target = target[PREVIEW];
   delta[KNOWN] = 0;
   for (int j = 0; j < KNOWN; j++) {
     const real *at = target + DELAY + j;

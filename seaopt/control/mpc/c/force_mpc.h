@@ -13,6 +13,7 @@ typedef struct {
   force_mpc_real past[FORCE_MPC_DELAY + 2]; /* commands that still act, oldest first; the last entry is scratch */
   force_mpc_real command;              /* the last, a FORCE_MPC_COMMAND in FORCE_MPC_COMMAND_UNIT */
   force_mpc_real reference;            /* the last that was finite, in FORCE_MPC_UNIT as what is measured */
+  force_mpc_real target;               /* the last reference known, or the nearest that the limits can hold */
   force_mpc_real estimate;             /* of what is measured */
   force_mpc_real plan[FORCE_MPC_KNOTS];
   force_mpc_program program;      /* what it held last is where the next begins */

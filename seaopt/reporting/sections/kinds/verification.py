@@ -74,7 +74,7 @@ def _tabulate_worst(verification: Verification) -> Table:
             format_number(verification.scenario(row).final_error, 3),
             "" if row.overshoot is None else f"{100 * row.overshoot:.3g} %",
             format_number(row.settling_s, 3),
-            format_number(row.peak_current_A, 3),
+            format_number(row.peak_command, 3),
             f"{100 * row.saturated:.3g} %",
             format_number(None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad), 3),
             format_number(row.peak_energy_J, 3),
