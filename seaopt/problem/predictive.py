@@ -35,7 +35,8 @@ def _check_keys(table: ProblemTable, controller: ControllerTable) -> None:
         taken.add("robust_to")
     stated = sorted(controller.model_fields_set - taken)
     if stated:
-        raise ProblemError(f'controller.{stated[0]} shapes gains, and structure = "mpc" has none; take it out')
+        remedy = "name them in plants of [robustness]" if stated[0] == "robust_to" else "take it out"
+        raise ProblemError(f'controller.{stated[0]} shapes gains, and structure = "mpc" has none; {remedy}')
     if not isinstance(controller.measured, str):
         raise ProblemError(
             f'controller.measured = {list(controller.measured)}: structure = "mpc" reads one output; write measured = '

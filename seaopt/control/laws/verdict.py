@@ -106,8 +106,8 @@ class PossibleBandwidths:
         if self.largest_hz is None and self.closest_hz is None:
             return "no stable law was found at other bandwidths"
         if self.largest_hz is None:
-            closest = f"the closest is {self.closest_hz:.4g} Hz, which exceeds one by {self.missed_by:.1%}"
-            return f"no bandwidth that meets all limits was found; {closest}"
+            missed = f"at {self.closest_hz:.4g} Hz, where the least is missing, one is exceeded by {self.missed_by:.1%}"
+            return f"no bandwidth that meets all limits was found; {missed}"
         nearest = " and ".join(f"{f:.4g} Hz" for f in self.nearest_hz)
         most = "" if self.largest_hz in self.nearest_hz else f", {self.largest_hz:.4g} Hz at most"
         verb = "is" if len(self.nearest_hz) == 1 else "are"

@@ -137,7 +137,7 @@ def certify(
     simulations : bool
         Play every scenario on the nonlinear plants, with large signals, passivity and environments, as
         `Certificate.with_simulation` does, of a schedule at its points and in sweeps. False plays steps of several
-        sizes alone, which takes a few seconds less; so does predictive control, beside its runs.
+        sizes alone, which takes a few seconds less; so does predictive control, as exported, beside its runs.
     large_signals : bool
         With the simulations, sweep amplitudes for the curve of bandwidth against them, of which nothing is required.
     thorough : bool
@@ -267,8 +267,8 @@ def _check_responses(law: Controller, plants: Plants, measured: Mapping[str, Mea
         )
     if plants:
         raise ControlError(
-            f"the controller was designed on a measured response, and plants names {', '.join(plants)}; "
-            "to certify it on models design it on one: robust_to then takes the response"
+            f"the controller was designed on a measured response, and plants names {', '.join(plants)}; to certify it "
+            "on models too give its with_model, whose design plant is the model of what was measured"
         )
     if not measured:
         raise ControlError(

@@ -90,7 +90,7 @@ def test_where_nothing_is_possible_the_least_miss_is_named(bench):
     possible = controller.possible
     assert not controller.feasible and possible.nearest_hz == () and possible.largest_hz is None
     assert 6.0 <= possible.closest_hz <= 60.0 and possible.missed_by > 0.0  # the range has no say in what is found
-    assert f"the closest is {possible.closest_hz:.4g} Hz" in controller.explanation
+    assert f"at {possible.closest_hz:.4g} Hz, where the least is missing, " in controller.explanation
     assert controller.achieved.stable and controller.gains["k_i"] >= 2 * np.pi * 0.05 * (1 + controller.gains["k_p"])
 
 
