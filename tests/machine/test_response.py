@@ -15,7 +15,7 @@ from seaopt.machine.design_run import run_design
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import LeftOut, cut_periods, find_period, join_blocks
-from seaopt.machine.response.verdicts import Measured, judge_response
+from seaopt.machine.response.verdicts import Measured, judge_response, measure
 from seaopt.machine.ticks import take_ticks
 from tests.machine.conftest import FRICTION, make_dry
 from tests.machine.simulator import Bench, Machine, multisine
@@ -91,9 +91,8 @@ def test_a_line_at_which_the_effort_is_not_sure_is_the_one_that_decides_with_per
     count, effort = len(blocks.effort), blocks.effort.copy()
     turns = np.exp(2j * np.pi * np.arange(count) / count)  # of no mean
     effort[:, -1] += turns * np.abs(np.mean(effort[:, -1])) / 2.5 * np.sqrt(count - 1.0)  # 2.5 std of it, of 5 asked
-    (row,) = (
-        row for row in judge_response(controller, [replace(blocks, effort=effort)], 0.95).judged if row.name == "Ms"
-    )
+    changed = replace(blocks, effort=effort, unbroken=None)
+    (row,) = (row for row in judge_response(controller, [changed], 0.95).judged if row.name == "Ms")
     assert (row.outcome, row.periods, row.where_hz) == ("undecided", 4 * count, blocks.f[-1]) and row.high < row.limit
 
 
@@ -265,6 +264,35 @@ def test_where_a_limit_is_refuted_no_periods_are_asked_for_another(controller, b
     assert "refuted" in outcomes and any(row.periods for row in result.response.judged)
     words = " ".join(str(result).split())
     assert "mend what is refuted first, then record again" in words and "periods in all" not in words
+
+
+def measure_errors(controller, bench, name, periods, seeds, noise=1.0):
+    """Return the errors of logs' loop or tracking over the equations', the std that each states, and its radius."""
+    errors, stds, radii = [], [], []
+    for seed in range(seeds):
+        log = bench.log(Machine(), REFERENCE[: 1000 * (periods + 1)], noise=noise, seed=seed)
+        part = measure(controller, cut_periods(controller, take_ticks(controller, log)), by_phases=False)
+        assert part.blocks == periods
+        loop, tracking = respond(Machine(), part.f, controller, 1)
+        centre, radius = getattr(part, name).disc(0.05)
+        errors.append(np.abs(centre - {"loop": loop, "tracking": tracking}[name]))
+        stds.append(getattr(part, name).std)
+        radii.append(radius)
+    return part.f, np.array(errors), np.array(stds), np.array(radii)
+
+
+@pytest.mark.parametrize(("name", "periods"), [("loop", 9), ("tracking", 9), ("loop", 3)])
+def test_discs_hold_the_loop_of_the_equations_as_often_as_they_state_at_slow_lines_and_at_fast_ones(
+    controller, bench, name, periods
+):
+    """Noise that goes round the loop moves the motor: below 11 Hz, what the ends of a period add to its coefficient is
+    twice the noise at its line.
+    """
+    f, errors, stds, radii = measure_errors(controller, bench, name, periods, 60)
+    for chosen in (f <= 11.0, (f > 11.0) & (f <= 40.0), f > 40.0):
+        size = np.mean(errors[:, chosen] ** 2 / np.mean(stds[:, chosen] ** 2, axis=0))
+        held, count = np.mean(errors[:, chosen] <= radii[:, chosen]), errors[:, chosen].size
+        assert 0.8 < size < 1.2 and abs(held - 0.95) < 4.0 * np.sqrt(0.05 * 0.95 / count), (size, held)
 
 
 def test_phases_are_told_apart_and_the_first_period_of_each_is_left_out(controller, bench):

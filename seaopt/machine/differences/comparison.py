@@ -184,7 +184,7 @@ class Comparison:
             except LogError:  # of each set of phases, the periods that were not at the limit are others
                 blocks.append(cut_periods(self.controller, replace(simulated, command=0.0 * ticks.command)))
         responses = self.controller.law.responses
-        return [replace(group, effort=group.make_efforts(responses(group.f))) for group in join_blocks(blocks)]
+        return [group.follow(responses(group.f)) for group in join_blocks(blocks)]
 
     def read(self, groups: Sequence[Blocks]) -> Lines:
         """Return the responses of periods to the effort, signal by signal, amplitude by amplitude."""

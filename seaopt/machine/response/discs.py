@@ -5,8 +5,9 @@ With :math:`Z_p, W_p` of P blocks, of one true ratio :math:`H = Z/W`,
 .. math:: \hat H = \bar Z/\bar W, \qquad s^2 = \frac{\sum_p |Z_p - \hat H W_p|^2}{P (P-1) |\bar W|^2}, \qquad
           R(a)^2 = s^2 (P-1) \big(a^{-1/(P-1)} - 1\big) .
 
-The error of :math:`\hat H` is complex normal, and :math:`|\hat H - H|^2 > R(a)^2` has the probability a. One side of
-it, along a radius, is a t distribution of 2P - 2 degrees of freedom: :math:`x = s\,t_{1-a;\,2P-2}/\sqrt 2`.
+The blocks are periods of a run, scattered by the noise about each line (`seaopt.machine.response.periods`), or means of
+periods. The error of :math:`\hat H` is complex normal, and :math:`|\hat H - H|^2 > R(a)^2` has the probability a. One
+side of it, along a radius, is a t distribution of 2P - 2 degrees of freedom: :math:`x = s\,t_{1-a;\,2P-2}/\sqrt 2`.
 
 That takes :math:`\bar W` for known, which it is not where it is below five of its own std. There the set is that of
 Fieller (J. R. Stat. Soc. B 16, 1954): every H for which :math:`\bar Z - H \bar W` is no further from zero than its own

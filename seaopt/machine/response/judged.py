@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.machine.response.discs import Ratio
+from seaopt.machine.response.discs import EXACT, Ratio
 from seaopt.machine.response.periods import LeftOut
 from seaopt.records import record
 
@@ -79,7 +79,8 @@ class Measured:
         at no line.
         """
         centre, radius = self.plant.disc(alpha / self.f.size)
-        off = np.where(np.abs(self.direct - centre) > radius, np.abs(self.direct / centre - 1.0), 0.0)
+        apart = np.abs(self.direct - centre)
+        off = np.where(apart > np.maximum(radius, EXACT * np.abs(centre)), np.abs(self.direct / centre - 1.0), 0.0)
         at = int(np.argmax(off))
         if not off[at]:
             return None

@@ -1,4 +1,16 @@
-"""Periods of a log under a periodic reference: where they are, and their Fourier coefficients at its lines."""
+r"""Periods of a log under a periodic reference: where they are, and their Fourier coefficients at its lines.
+
+Noise that goes round a loop moves its states. The coefficient of a period p holds, beside the noise at its line, what
+the state at its start has more than at its end, :math:`t_p - t_{p+1}`; the mean over P periods that follow each other
+holds only :math:`(t_1 - t_{P+1})/P`. From period to period the coefficients therefore scatter by more than the error of
+their mean tells, at the lines below the loop's bandwidth by up to five times its square. Of such a run there are
+coefficients without that, too: with X the transform of all of its rows, whose line k P is line k of the periods,
+
+.. math:: Z_p = \frac1P \sum_j X_{kP + j}\, e^{2 \pi i j (p + 1/2)/P}, \qquad -P/2 < j \le P/2 ,
+
+has the same mean, :math:`X_{kP}/P`, and scatters by the noise at the P - 1 lines of the record about it, which have
+what its ends add as much as the mean has (Pintelon and Schoukens, System Identification, 2012, chapter 7).
+"""
 
 from __future__ import annotations
 
@@ -79,6 +91,7 @@ class Blocks:
     noise: float  # std of the command from period to period of one set of phases; 0 where there is one of each
     left_out: LeftOut
     between: Complex[np.ndarray, "b k"]  # what is regulated, where the reference has nothing: noise and distortion
+    unbroken: Blocks | None = None  # the same, scattered by the noise about each line alone
 
     @property
     def realisations(self) -> int:
@@ -88,6 +101,11 @@ class Blocks:
     def make_efforts(self, responses: Complex[np.ndarray, "k m"]) -> Complex[np.ndarray, "b m"]:
         """Return what a linear law of these responses makes of the reference and of what it reads."""
         return responses[0] * self.reference + np.sum(responses[1:] * self.measured, axis=1)
+
+    def follow(self, responses: Complex[np.ndarray, "k m"]) -> Blocks:
+        """Return the periods with the efforts that a linear law of these responses makes."""
+        unbroken = None if self.unbroken is None else self.unbroken.follow(responses)
+        return replace(self, effort=self.make_efforts(responses), unbroken=unbroken)
 
     def average(self) -> Blocks:
         """Return one row per stretch, the mean of its periods."""
@@ -100,7 +118,7 @@ class Blocks:
         beside = {name: np.array([part[chosen].mean(axis=0) for chosen in rows]) for name, part in self.beside.items()}
         return replace(
             self, reference=reference, effort=effort, measured=measured, beside=beside, between=between,
-            realisation=kinds,
+            realisation=kinds, unbroken=None,
         )  # fmt: skip
 
 
@@ -288,7 +306,7 @@ def _transform(
     lines = lines[lines < (period - 1) // 2]
     between = np.flatnonzero(strength <= NOT_PLAYED * np.max(strength))[1:]
     scale = 2.0 / period
-    return Blocks(
+    blocks = Blocks(
         f=lines * ticks.rate_hz / period,
         reference=scale * reference[:, lines],
         effort=scale * command[:, lines] / controller.command.per_effort,
@@ -303,6 +321,30 @@ def _transform(
         left_out=left_out,
         between=scale * measured[:, 0, between],
     )
+    columns = np.column_stack([ticks.command, ticks.measured, *ticks.beside.values()])
+    effort, *others = (scale * _transform_runs(columns, rows[:, 0], period, lines)).swapaxes(0, 1)
+    inputs = ticks.measured.shape[1]
+    unbroken = replace(
+        blocks,
+        effort=effort / controller.command.per_effort,
+        measured=np.stack(others[:inputs], axis=1),
+        beside=dict(zip(ticks.beside, others[inputs:], strict=True)),
+    )
+    return replace(blocks, unbroken=unbroken)
+
+
+def _transform_runs(
+    columns: Float[np.ndarray, "n c"], starts: Int[np.ndarray, " b"], period: int, lines: Int[np.ndarray, " m"]
+) -> Complex[np.ndarray, "b c m"]:
+    """Return coefficients of periods from the transforms of all that follow each other."""
+    parts = list[Complex[np.ndarray, "p c m"]]()
+    for run in np.split(starts, np.flatnonzero(np.diff(starts) != period) + 1):
+        count = run.size
+        about = np.arange(-((count - 1) // 2), count // 2 + 1)
+        spectrum = np.fft.rfft(columns[run[0] : run[0] + count * period], axis=0)
+        turned = np.exp(2j * np.pi * np.outer(np.arange(count) + 0.5, about) / count) / count
+        parts.append(np.einsum("pj,jmc->pcm", turned, spectrum[count * lines + about[:, None]]))
+    return np.concatenate(parts)
 
 
 def _find_noise(command: Float[np.ndarray, "b n"], numbers: Sequence[int]) -> float:
@@ -332,6 +374,7 @@ def _join(group: Sequence[Blocks]) -> Blocks:
     if len(group) == 1:
         return group[0]
     names = set.intersection(*(set(part.beside) for part in group))
+    unbroken = [part.unbroken for part in group if part.unbroken is not None]
     offsets = np.cumsum([0, *(int(np.max(part.realisation)) + 1 for part in group[:-1])])
     return replace(
         group[0],
@@ -345,4 +388,5 @@ def _join(group: Sequence[Blocks]) -> Blocks:
         swing=max(part.swing for part in group),
         noise=max(part.noise for part in group),
         left_out=sum((part.left_out for part in group), LeftOut()),
+        unbroken=_join(unbroken) if len(unbroken) == len(group) else None,
     )

@@ -153,8 +153,8 @@ def measure(controller: Controller, blocks: Blocks, by_phases: bool) -> Measured
     """Return the response of periods of one amplitude; `by_phases`: of means over the periods of each set of phases."""
     responses = controller.law.responses(blocks.f)
     if has_terms(controller):
-        blocks = replace(blocks, effort=blocks.make_efforts(responses))
-    rows = blocks.average() if by_phases else blocks
+        blocks = blocks.follow(responses)
+    rows = blocks.average() if by_phases else blocks.unbroken or blocks
     feedback = -responses[1:]
     effort = rows.effort / rows.reference
     measured = rows.measured / rows.reference[:, None, :]
