@@ -3,8 +3,9 @@
     python benchmarks/acceptance/run.py --seeds 5 [--on stand knee] [--first 100] [--only FAULT ...] [-o FILE.json]
 
 The machines are those of tests/machine/machine.c, which shares no equation with seaopt, under the exported C: the THOR
-stand with a pid at 30 Hz, and a rotary knee with dry friction under a pid with a disturbance observer at 20 Hz. Each
-seed draws the machine within the certificate's uncertainty, noise, phases and the resolution of the log.
+stand with a pid at 30 Hz, and a rotary knee with dry friction at 20 Hz under a pid whose disturbance observer is all
+that integrates. Each seed draws the machine within the certificate's uncertainty, noise, phases and the resolution of
+the log, for each fault anew.
 """
 
 from __future__ import annotations
@@ -136,9 +137,9 @@ def make_knee():
     plant = so.plants.rotary(link="locked")
     stated = {"N": 100, "K_tau": 0.0369, "eta": 0.7, "J_m": 2.4e-5, "b_r": 1e-4, "f_c": 0.005, "v_s": 1.0, "k_s": 300.0}
     values = plant.complete(so.ParameterSet()).update(**stated)
-    spec = so.ControllerSpec(
+    spec = so.ControllerSpec(  # its observer is its only integral
         bandwidth_hz=20, structure="pid_dob", measured="tau_s", max_sensitivity=1.6, max_noise_gain=45,
-        current_limit_A=9.0,
+        reference_weights="error", current_limit_A=9.0,
     )  # fmt: skip
     ranges = {"eta": (0.68, 0.72), "b_r": (0.9e-4, 1.1e-4), "f_c": (0.004, 0.006)}
     return Subject(
@@ -167,16 +168,24 @@ def judge(subject, bench, machine, period, rng):
     return result, [(found[0].kind, name) for name in (found[0].name, *found[0].alike)] if found else [()]
 
 
-def cover(result, bench, machine):
-    """Return how many discs at 95 % hold the loop of the machine's own equations, and how many there are."""
+def cover(result, subject, bench, machine):
+    """Return by group how many discs at 95 % hold the loop and the tracking of the machine's own equations, of how
+    many. Those of the plant, of 1 + L and of the sensitivity are the loop's.
+    """
     from tests.machine.test_response import respond
 
-    held = count = 0
+    groups = {}
     for part in result.response.measured:
-        truth = respond(machine, part.f, bench.controller, 1)[0]
-        centre, radius = part.loop.disc(0.05)
-        held, count = held + int(np.sum(np.abs(centre - truth) <= radius)), count + truth.size
-    return held, count
+        truths = respond(machine, part.f, bench.controller, 1)
+        slow, fast = part.f <= subject.spec.bandwidth_hz / 3.0, part.f > 4.0 / 3.0 * subject.spec.bandwidth_hz
+        bands = {"slow": slow, "about the bandwidth": ~slow & ~fast, "fast": fast}
+        for name, truth in zip(("loop", "tracking"), truths, strict=True):
+            centre, radius = getattr(part, name).disc(0.05)
+            held = np.abs(centre - truth) <= radius
+            for band, chosen in bands.items():
+                counts = np.array([np.sum(held[chosen]), np.sum(chosen)])
+                groups[name, band] = groups.get((name, band), 0) + counts
+    return groups
 
 
 def find_broken(result, bench, machine):
@@ -201,14 +210,14 @@ def find_broken(result, bench, machine):
 
 def run_subject(name, options):
     """Print and return how often each fault of a subject is found and named."""
-    subject, table, held, count, broken, judged = SUBJECTS[name](), {}, 0, 0, 0, 0
-    for fault in subject.list_faults(subject.machine):
+    subject, table, covered, broken, judged = SUBJECTS[name](), {}, {}, 0, 0
+    for number, fault in enumerate(subject.list_faults(subject.machine)):
         if options.only and fault not in options.only:
             continue
         found = named = 0
         otherwise = []
         for seed in range(options.first, options.first + options.seeds):
-            rng = np.random.default_rng([seed, 7])
+            rng = np.random.default_rng([seed, 7, number])
             key, faulty, period, expected = subject.list_faults(subject.draw(rng))[fault]
             result, names = judge(subject, subject.benches[key], faulty, period, rng)
             right = any(each in expected for each in names)
@@ -218,15 +227,17 @@ def run_subject(name, options):
             if not expected and not result.met:
                 otherwise.append(f"{seed}: {result!r}")
             if fault in LINEAR and not faulty.coulomb and result.response is not None:
-                a, b = cover(result, subject.benches[key], faulty)
-                held, count = held + a, count + b
+                for (quantity, band), counts in cover(result, subject, subject.benches[key], faulty).items():
+                    for group in ((quantity, "all"), (quantity, band), (quantity, fault)):
+                        covered[group] = covered.get(group, 0) + counts
                 broken, judged = broken + len(find_broken(result, subject.benches[key], faulty)), judged + 5
         table[fault] = {"found": found, "named": named, "of": options.seeds, "otherwise": otherwise}
         counts = f"found {found:3d}/{options.seeds}  named {named:3d}/{options.seeds}"
         print(f"{name:6s} {fault:22s} {counts}  {otherwise}", flush=True)
-    if count:
-        wrongly = f"{broken} of {judged} rows refuted wrongly"
-        print(f"discs at 95 %: {100.0 * held / count:.1f} % of {count} hold the truth; {wrongly}")
+    for (quantity, group), (held, count) in covered.items():
+        print(f"discs at 95 % of the {quantity}, {group}: {100.0 * held / count:.1f} % of {count} hold the truth")
+    if covered:
+        print(f"{broken} of {judged} rows refuted wrongly")
     return table
 
 
