@@ -130,6 +130,14 @@ def test_a_constant_channel_is_found(short_log):
     assert assess_quality(table(short_log, F2=np.full(len(short_log), 3.0))).of("constant")[0].channel == "F2"
 
 
+@pytest.mark.parametrize(("unit", "held"), [("rad", True), ("m/s", True), ("N", False), ("A", False)])
+def test_a_motion_that_stands_still_may_be_that_of_a_link_that_is_held(short_log, unit, held):
+    still = Signal(name="link", values=np.full(len(short_log), 0.3), unit=unit)
+    log = RawLog(time=short_log.time, signals={"F1": short_log.signals["F1"], "link": still}, source="test")
+    (finding,) = assess_quality(log).of("constant")
+    assert ("link is held" in finding.sentence) == held and "wiring" in finding.sentence
+
+
 @pytest.mark.parametrize("length", [15, 200])
 @pytest.mark.parametrize("quantum", [0.0, 0.5])
 def test_a_frozen_sensor_is_stuck(short_log, length, quantum):

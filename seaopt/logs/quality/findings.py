@@ -21,6 +21,7 @@ from seaopt.signals import SAME_SIGN, VectorN
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+MOTIONS = ("m", "rad", "m/s", "rad/s")  # units of what stands still where its link is held
 MAX_PLACES = 20  # that a finding lists
 COARSE_LEVELS, FINE_LEVELS = 32, 4096  # in a channel's range: a warning below the one, no finding above the other
 MOST_BRIDGED = 50  # missing samples in a row of a device with times of its own
@@ -141,7 +142,8 @@ def find_channel_faults(channel: ChannelQuality, time: VectorN, *, may_drive: bo
     if missing.samples + beyond.size == time.size:
         return
     if channel.constant:
-        text = f"{name} is {format_figure(channel.low, unit)} throughout; check its wiring, or leave it out"
+        advice = f"leave it out{' if the link is held' if unit in MOTIONS else ''}, or check its wiring"
+        text = f"{name} is {format_figure(channel.low, unit)} throughout; {advice}"
         yield Finding(kind="constant", severity="warning", channel=name, value=channel.low, unit=unit, sentence=text)
         return
     if len(channel.stuck):
