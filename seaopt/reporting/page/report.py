@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from markupsafe import Markup
 
@@ -56,17 +56,6 @@ Result = (
     | LargeSignal
     | Frontier
 )
-KINDS: dict[str, type[Any]] = {
-    "fit": Fit,
-    "ranking": Ranking,
-    "controller": Controller,
-    "mpc": ForceMPC,
-    "certificate": Certificate,
-    "verification": Verification,
-    "coupled": StabilityMap,
-    "schedule": ScheduledController,
-    "frontier": Frontier,
-}
 PARTS = {
     "expectations": "What the problem file expects",
     "controller": "Controller",
@@ -107,6 +96,13 @@ class Material:
     large: tuple[LargeSignal, ...] = ()
     passivity: Passivity | None = None
     diagnostics: Diagnostics | None = None
+
+
+KINDS: dict[str, type[Any]] = {  # of what may be given, those of which there is one at most
+    name: kind
+    for name, hint in get_type_hints(Material).items()
+    if name != "large" and (kind := get_args(hint)[0]) in get_args(Result)
+}
 
 
 @record(eq=False)
@@ -177,7 +173,7 @@ def write_report(
     for result in results:
         require_type(
             result,
-            (*KINDS.values(), LargeSignal),
+            get_args(Result),
             "results",
             "give what fit, tune, certify, verify or compare returned",
         )
