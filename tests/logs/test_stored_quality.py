@@ -12,6 +12,7 @@ from seaopt.files import read_json, seal, to_json, write_json
 from seaopt.logs import Quality, RawLog, assess_quality
 from seaopt.logs.quality.report import QUALITY_SCHEMA
 from seaopt.signals import Signal
+from tests.damage import damage
 
 N = 4000
 
@@ -80,21 +81,16 @@ def test_what_was_read_is_what_the_file_counts(content):
         (("findings", 0), "severity", "mild", r"findings\.1\.severity"),
         ((), "met", True, "met is True"),
         ((), "rate_hz", 100.0, "rate_hz is 100"),
-        (("pairs", 0), "lag_s", None, r"pairs\.1\.lag_s"),
+        (("pairs", 0), "lag_s", float("nan"), r"pairs\.1\.lag_s"),
     ],
 )
 def test_a_damaged_quality_is_refused(content, place, key, value, words):
-    damaged = json.loads(json.dumps(content))
-    table = damaged
-    for part in place:
-        table = table[part]
-    assert table[key] != value
-    table[key] = value
+    damaged, edited = damage(content, place, key, value)
     with pytest.raises(FileError, match=words) as caught:
-        Quality.from_dict(seal({name: each for name, each in damaged.items() if name != "made_from"}))
+        Quality.from_dict(damaged)
     assert str(caught.value).startswith("quality.json") and "\n" not in str(caught.value)
     with pytest.raises(FileError, match="edited"):
-        Quality.from_dict(damaged)
+        Quality.from_dict(edited)
 
 
 @pytest.mark.parametrize("key", ["clock", "channels", "findings", "excitation"])

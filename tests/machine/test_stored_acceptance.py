@@ -11,6 +11,7 @@ from seaopt.errors import FileError
 from seaopt.files import read_json, seal, to_json, write_json
 from seaopt.machine import Acceptance
 from seaopt.machine.acceptance import ACCEPTANCE_SCHEMA
+from tests.damage import damage
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
 
@@ -63,24 +64,19 @@ def test_an_acceptance_is_read_back(results, controller, name, tmp_path, monkeyp
         ((), "met", False, "met is False"),
         (("replay", "logs", 0), "ticks", "all", r"logs\.1\.ticks"),
         (("replay", "logs", 0), "met", False, "replay.met|met is True"),
-        (("response",), "confidence", None, r"response\.confidence"),
+        (("response",), "confidence", float("nan"), r"response\.confidence"),
         (("response", "figures", 0), "outcome", "sure", r"response\.figures\.1\.outcome"),
         (("response", "figures", 0), "limit", "1.6", r"response\.figures\.1\.limit"),
         (("differences",), "misfit", [], r"differences\.misfit"),
     ],
 )
 def test_a_damaged_acceptance_is_refused(content, controller, place, key, value, words):
-    damaged = json.loads(json.dumps(content))
-    table = damaged
-    for part in place:
-        table = table[part]
-    assert table[key] != value
-    table[key] = value
+    damaged, edited = damage(content, place, key, value)
     with pytest.raises(FileError, match=words) as caught:
-        Acceptance.from_dict(seal({name: each for name, each in damaged.items() if name != "made_from"}), controller)
+        Acceptance.from_dict(damaged, controller)
     assert str(caught.value).startswith("acceptance.json") and "\n" not in str(caught.value)
     with pytest.raises(FileError, match="edited"):
-        Acceptance.from_dict(damaged, controller)
+        Acceptance.from_dict(edited, controller)
 
 
 @pytest.mark.parametrize("key", ["met", "replay", "response", "differences", "place"])

@@ -14,6 +14,7 @@ from seaopt.files import read_json, seal, to_json, write_json
 from seaopt.progress import ignore
 from seaopt.reporting.responses import FRF_SCHEMA, Responses, estimate_responses
 from seaopt.reporting.sections import write_text
+from tests.damage import damage
 
 PROBLEM = """
 schema = 1
@@ -85,16 +86,13 @@ def test_what_is_read_is_the_second_order_form_of_the_paper(problem, content):
     ],
 )
 def test_damaged_responses_are_refused(problem, content, place, key, value, words):
-    damaged = json.loads(json.dumps(content))
-    table = damaged if key == "experiments" else damaged["experiments"]["chirp"]
-    for part in place:
-        table = table[part]
-    table[key] = value
+    inside = () if key == "experiments" else ("experiments", "chirp")
+    damaged, edited = damage(content, (*inside, *place), key, value)
     with pytest.raises(FileError, match=words) as caught:
-        Responses.from_dict(seal({name: each for name, each in damaged.items() if name != "made_from"}), problem)
+        Responses.from_dict(damaged, problem)
     assert str(caught.value).startswith("frf.json") and "\n" not in str(caught.value)
     with pytest.raises(FileError, match="edited"):
-        Responses.from_dict(damaged, problem)
+        Responses.from_dict(edited, problem)
 
 
 def test_responses_of_another_problem_or_version_are_refused(problem, content, tmp_path):
