@@ -71,6 +71,13 @@ def test_what_is_read_is_the_second_order_form_of_the_paper(problem, content):
     assert abs(pair.second_order.b.value - 655000 / 295.2) < 4.0 * pair.second_order.b.std
 
 
+def test_figures_of_another_machine_are_read_back(problem, content):
+    pair = content["experiments"]["chirp"]["pairs"][0]
+    place = ("experiments", "chirp", "pairs", 0)
+    written, _ = damage(content, place, "model_misfit", pair["model_misfit"] * (1.0 + 1e-7))
+    assert Responses.from_dict(written, problem).surveys.keys() == {"chirp"}
+
+
 @pytest.mark.parametrize(
     ("place", "key", "value", "words"),
     [

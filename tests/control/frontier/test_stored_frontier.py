@@ -47,6 +47,13 @@ def test_figures_of_an_unstable_loop_are_read_back(frontier, content, stand, tho
     assert isinstance(read, FrontierRow) and read.ms == read.noise_gain == read.disturbance == float("inf")
 
 
+def test_figures_of_another_machine_are_read_back(content, stand, thor):
+    """A bandwidth is known to the root of rounding, which another machine's library has otherwise."""
+    width = content["controllers"][0]["achieved"]["bandwidth_hz"]
+    written, _ = damage(content, ("controllers", 0, "achieved"), "bandwidth_hz", width * (1.0 + 1e-7))
+    assert Frontier.from_dict(written, stand, thor).controllers[0].achieved.bandwidth_hz == pytest.approx(width)
+
+
 @pytest.mark.parametrize(
     ("place", "key", "value", "words"),
     [
