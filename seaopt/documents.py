@@ -86,8 +86,10 @@ def _describe(model: type[BaseModel], problem: ValidationError, remedy: str) -> 
         keys = [field.alias or name for name, field in _find_model(model, first["loc"]).model_fields.items()]
         near = get_close_matches(str(first["loc"][-1]), keys, n=1, cutoff=0.6)
         if not near and len(keys) > MOST_KEYS:
-            listed = f"seaopt schema problem, or the page Keys of a problem file, lists its {len(keys)}"
-            return f"unknown key {path}; no key of {_name_table(path)} is named alike: {listed}"
+            return (
+                f"unknown key {path}; {_name_table(path)} has {len(keys)} keys, none of them named alike: type seaopt "
+                "schema problem, or read the page Keys of a problem file"
+            )
         line = f" write {near[0]} = {_spell(first['input'])}" if near else ""
         return f"unknown key {path}; {suggestion(str(first['loc'][-1]), keys)}{line}"
     if _is_range(first):
