@@ -15,7 +15,7 @@ import seaopt as so
 from seaopt.control import Prefilter, export_mpc
 from seaopt.control.mpc.stored import check_described, describe_mpc
 from seaopt.files import to_json
-from seaopt.problem.stages import certify_problem, check_mpc_file, design_mpc, tune_problem
+from seaopt.problem.stages import certify_problem, check_mpc_file, design_mpc, read_sweep, tune_problem
 
 PLANNED = """
 schema = 1
@@ -192,6 +192,8 @@ def test_a_sweep_says_what_the_linear_region_of_each_plan_does(planned, seaopt):
     z, problem = np.exp(2j * np.pi * f * period), so.read_problem(planned / "plan.toml")
     plant = so.plants.high_impedance(drive="unlumped").linearize(problem.parameters)
     sampled = control.sample_system(plant["F1", "I"], period, "zoh")
+    again = read_sweep(problem, problem.parameters, content)
+    assert [row.met for row in again.rows] == [law.met for law in again.controllers]
     for row, stored, asked in zip(content["rows"], content["controllers"], (15.0, 25.0), strict=True):
         mpc = design_mpc(replace(problem, mpc=replace(problem.mpc, bandwidth_hz=asked)), problem.parameters)
         check_described(stored["mpc"], mpc, source="frontier.json", problem="plan.toml", remedy="")
