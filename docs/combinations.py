@@ -61,7 +61,8 @@ samples = 6
 constrained_runs = 1
 ROBUSTNESS
 """
-LIMITS = "bandwidth_hz = 16\nmax_sensitivity = 1.7\nmax_noise_gain = 60\nrobust_to = [ROBUST_TO]"
+TUNED = "bandwidth_hz = 16\nrobust_to = [ROBUST_TO]"
+LIMITS = f"{TUNED}\nmax_sensitivity = 1.7\nmax_noise_gain = 60"
 SCHEDULE = '[controller.schedule]\nover = "k_s"\npoints = [280, 320]'
 EXPERIMENT = """[[experiment]]
 name = "chirp"
@@ -80,7 +81,7 @@ LAWS: Mapping[str, Mapping[str, str]] = {
     "schedule of `pid`": {"STRUCTURE": f'structure = "pid"\n{LIMITS}', "SCHEDULE": SCHEDULE},
     "schedule of `pid_dob`": {"STRUCTURE": f'structure = "pid_dob"\n{LIMITS}', "SCHEDULE": SCHEDULE},
     "schedule of `cascade`": {"STRUCTURE": f'structure = "cascade"\n{LIMITS}', "SCHEDULE": SCHEDULE, "MEASURED": BOTH},
-    "predictive control": {"STRUCTURE": 'structure = "mpc"\nbandwidth_hz = 16'},
+    "predictive control": {"STRUCTURE": f'structure = "mpc"\n{TUNED}', "LINKED": ""},
     "`pid` designed on `frf:`": {
         "STRUCTURE": f'structure = "pid"\n{LIMITS}', "PLANT": "frf:chirp", "EXPERIMENT": EXPERIMENT, "CERTIFIED": "",
     },
@@ -94,7 +95,7 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "nothing else": {},
     "`notch`": {"CONTROLLER": "notch = true"},
     "`prefilter`": {"CONTROLLER": 'prefilter = "second_order"'},
-    "`link_feedforward`": {"CONTROLLER": "link_feedforward = true", "ROBUST_TO": '"swing"', "CERTIFIED": '"swing"'},
+    "`link_feedforward`": {"CONTROLLER": "link_feedforward = true", "ROBUST_TO": "LINKED", "CERTIFIED": '"swing"'},
     "friction, from the reference": {"CONTROLLER": "compensate = { friction = { fraction = 0.4 } }", "COULOMB": "0.002"},
     "friction, from the speed": {
         "CONTROLLER": 'compensate = { friction = { fraction = 0.4, from = "speed" } }', "COULOMB": "0.002", "CERTIFIED": '"swing"',
@@ -103,12 +104,13 @@ PARTS: Mapping[str, Mapping[str, str]] = {
     "`[impedance]`": {"TABLES": '[impedance]\nplant = "swing"\nstiffness = 30\ndamping = 2.0'},
     "`[controller.gate]`": {"TABLES": "[controller.gate]\nrange_N = [-300, 300]"},
     "`derate`": {"CONTROLLER": "derate = true", "PARTS": 'parts = ["thermal"]'},
+    "another plant in `robust_to`": {"ROBUST_TO": '"swing"', "CERTIFIED": '"swing"'},
     "`frf:` in `robust_to`": {"ROBUST_TO": '"frf:chirp"', "EXPERIMENT": EXPERIMENT},
     "plants to certify on": {"CERTIFIED": '"swing"'},
     "`retune`": {"ROBUSTNESS": "retune = 2", "CERTIFIED": '"swing"'},
     "`seaopt tune --sweep`": {},
 }  # fmt: skip
-DEFAULTS = {"PLANT": "stand", "MEASURED": '"tau_s"', "ROBUST_TO": "", "CERTIFIED": '"stand"', "COULOMB": "0", "ROBUSTNESS": "retune = 0"}
+DEFAULTS = {"LINKED": '"swing"', "PLANT": "stand", "MEASURED": '"tau_s"', "ROBUST_TO": "", "CERTIFIED": '"stand"', "COULOMB": "0", "ROBUSTNESS": "retune = 0"}
 HEAD = """# What goes with what
 
 Each law (column) was tried with each part (row) by `python docs/combinations.py`, which writes this page from one run. A tick: the law was tuned (a law of your own: measured), certified, simulated with
@@ -128,7 +130,7 @@ here, and run the whole table.
 def write_file(law: str, part: str) -> str:
     """Return the problem file of a combination."""
     text, keys = FILE, [*dict.fromkeys((*LAWS[law], *PARTS[part], *DEFAULTS, "CONTROLLER", "SCHEDULE", "TABLES"))]
-    for key in [*keys, "ROBUST_TO", "PARTS", "EXPERIMENT", "ROBUSTNESS"]:
+    for key in [*keys, "ROBUST_TO", "LINKED", "PARTS", "EXPERIMENT", "ROBUSTNESS"]:
         text = text.replace(key, PARTS[part].get(key, LAWS[law].get(key, DEFAULTS.get(key, ""))))
     return text
 

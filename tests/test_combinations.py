@@ -46,6 +46,11 @@ def test_a_schedule_whose_link_is_fed_forward_is_certified(tmp_path):
     assert not combinations.try_combination("schedule of `pid`", "`link_feedforward`", tmp_path)
 
 
+def test_a_plan_is_played_where_friction_lets_go_late(tmp_path):
+    """Errors were measured by states that had hardly moved yet, and no step was short enough."""
+    assert not combinations.try_combination("predictive control", "friction, from the speed", tmp_path)
+
+
 @pytest.mark.slow
 def test_the_page_is_what_one_run_writes():
     assert combinations.write_page() == combinations.PAGE.read_text(encoding="utf-8")

@@ -130,6 +130,7 @@ def close_loop(
     start_command: float = 0.0,
     sticks: bool = False,
     rtol: float | None = None,
+    sizes: float | Float[np.ndarray, " nx"] = 0.0,
 ) -> ForceRun:
     """Run a law on a plant, from rest at zero where no other start is given.
 
@@ -173,6 +174,8 @@ def close_loop(
         Dry friction jumps at rest, so that what sticks stands still, in place of the smoothed curve.
     rtol : float, optional
         Of the integration, of each state's largest value so far.
+    sizes : float or array, shape (nx,)
+        At least that large the states will be.
 
     Raises
     ------
@@ -190,7 +193,7 @@ def close_loop(
         raise ControlError(f"preview_samples = {preview_samples!r} is not a whole number of samples; give 0, 1, ...")
     newer, n, p = delay_samples + whole, reference.size, values.vector
     output, names = DirectCall(observe_function(plant, sticks)), channel_names(plant)
-    integrator = _Integrator(plant=plant, sticks=sticks, rtol=rtol or (STICKING_RTOL if sticks else RTOL))
+    integrator = _Integrator(plant=plant, sticks=sticks, rtol=rtol or (STICKING_RTOL if sticks else RTOL), size=sizes)
     idle = [0.0] * (len(plant.inputs) - 1)
     devices, signals = sensors or Sensors(), list_names(measured)
     rng = np.random.default_rng(require_seed(seed, ControlError))

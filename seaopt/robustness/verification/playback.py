@@ -21,7 +21,7 @@ from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, 
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.control.running.law_step import find_faults
 from seaopt.control.running.sampled_loop import channel_names, find_longest_delay
-from seaopt.errors import ControlError, require_memory, require_seed
+from seaopt.errors import ControlError, StepSizeError, require_memory, require_seed
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
 from seaopt.plants.friction import can_stick
@@ -269,31 +269,42 @@ def run_plan(
     outer loop is given what it makes the reference of, an x_0 or a force, and asks for the force of one sample.
     """
     outer, reads = plan.outer, plan.reads
-    step, named = make_stepper(plan, start), (*reads, *(() if outer is None else (outer.position,)))
+    named = (*reads, *(() if outer is None else (outer.position,)))
     moved = tuple(dict.fromkeys(name for name in named if name in plant.outputs))
 
-    def law(state: Any, r: Any, y: Any) -> tuple[float, Any]:
-        kept, (force, *positions) = state, np.ravel(y).tolist()
-        places = dict(zip(moved, positions, strict=True))
-        if outer is not None:
-            x_0, besides = outer.split(r / outer.per_given)
-            kept = follow_link(outer.numbers, kept, x_0, places.get(outer.position, 0.0))
-            r = besides + kept[-1]
-        steps.append(step(r, force, [places.get(name, 0.0) for name in reads]))
-        return steps[-1].command, kept
+    def run(**tolerated: Any) -> ForceRun:
+        step = make_stepper(plan, start)
+        steps.clear()
 
-    return close_loop(
-        law,
-        FIRST,
-        plant,
-        values,
-        reference,
-        measured=(plan.measured, *moved),
-        sample_time_s=plan.sample_time_s,
-        delay_samples=plan.compute_delay_samples,
-        command_limit=plan.command_limit,
-        **options,
-    )
+        def law(kept: Any, r: Any, y: Any) -> tuple[float, Any]:
+            force, *positions = np.ravel(y).tolist()
+            places = dict(zip(moved, positions, strict=True))
+            if outer is not None:
+                x_0, besides = outer.split(r / outer.per_given)
+                kept = follow_link(outer.numbers, kept, x_0, places.get(outer.position, 0.0))
+                r = besides + kept[-1]
+            steps.append(step(r, force, [places.get(name, 0.0) for name in reads]))
+            return steps[-1].command, kept
+
+        return close_loop(
+            law,
+            FIRST,
+            plant,
+            values,
+            reference,
+            measured=(plan.measured, *moved),
+            sample_time_s=plan.sample_time_s,
+            delay_samples=plan.compute_delay_samples,
+            command_limit=plan.command_limit,
+            **options,
+            **tolerated,
+        )
+
+    try:
+        return run()
+    except StepSizeError:  # of a state that has hardly moved yet, as where friction lets go, errors look large
+        rough = run(rtol=np.inf)
+        return run(sizes=np.max(np.abs(rough.state), axis=0))
 
 
 def rest_plan(plan: ForceMPC, plant: Plant, values: ParameterSet, start: Equilibrium, run: int) -> MPCState:
