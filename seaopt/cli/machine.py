@@ -333,6 +333,7 @@ def plan_bring_up(
         return certify_problem(problem, law, source, large_signals=full, thorough=full)
 
     session.warn_of_design(session.problem.certified_plants().values())
+    list_broken_requirements(folder / FILES["tune"], folder / FILES["certify"])  # raises: it is of another law
     target = folder / BRING_UP
     with show_progress(errors, "planning the stages", errors.say) as tell:
 

@@ -22,7 +22,7 @@ from seaopt.formatting import join_words
 from seaopt.logs import Log
 from seaopt.machine.causes import Cause
 from seaopt.machine.decimated import shift_command
-from seaopt.machine.differences.certified import Differences, compare
+from seaopt.machine.differences.certified import EXPLAINED, Differences, compare
 from seaopt.machine.differences.rate_of_commands import find_rate
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.replay import Replay, replay, replay_stretches
@@ -41,7 +41,6 @@ from seaopt.robustness import check_ranges
 from seaopt.units import unit_after
 
 DRAWS, SEED = 200, 1
-EXPLAINED = 0.95  # of the difference, from which on another rate is what the figures are stated at
 OUTER_LOOP = (
     "an outer loop was closed around the law, so that the link and what touches it are in the response; give the plant "
     "of the link (link), or leave the outer loop out, with the link as in the design plant"
@@ -347,7 +346,7 @@ def accept(
         place = controller.over, rows[0].middle, controller.unit
     sources = tuple(log.source for log in logs)
     experiments = tuple(
-        (plant, replace(make_experiment(law, plant, ticks, row.command_late), law=_hash(controller)))
+        (plant, replace(make_experiment(law, plant, ticks, row.command_late), law=hash_source(controller)))
         for ticks, row in zip(map(_end_at_trip, rows, (row.trip for row in replays)), replays, strict=True)
         if row.met
         and row.position_stays is None
@@ -454,15 +453,15 @@ def _check_header(source: Source, log: Log, row: Replay, others: Others) -> Repl
     """Return a replay with the law that the log says it was taken under, where that is another and the replay does not
     tell why.
     """
-    if row.explained or isinstance(source, ForceMPC) or log.law in ("", _hash(source)):
+    if row.explained or isinstance(source, ForceMPC) or log.law in ("", hash_source(source)):
         return row
-    named = [name for name, other in others.items() if _hash(other) == log.law]
+    named = [name for name, other in others.items() if hash_source(other) == log.law]
     kind, what = ("another law", named[0]) if named else ("law by the log's header", f"another, {log.law}")
     cause = Cause(kind=kind, what=what, value=None, unit="", removes=1.0, explains=True)
     return replace(row, met=False, causes=(cause, *row.causes))
 
 
-def _hash(source: Source) -> str:
+def hash_source(source: Source) -> str:
     """Return what tells a law from any other, as the log of the target has it; of predictive control its linear law."""
     if isinstance(source, ScheduledController):
         return hash_law(source.runnable(), source.outer)

@@ -8,14 +8,16 @@ from seaopt.control import Controller
 from seaopt.formatting import format_number, join_words
 from seaopt.machine.alternatives import Edited, EditedGain
 from seaopt.machine.causes import Cause
+from seaopt.machine.differences.certified import Untold
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.gains.free_gains import SAME_GAINS
 from seaopt.machine.replay import Replay
-from seaopt.machine.response.judged import Bias
+from seaopt.machine.response.judged import Bias, Judged
 from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band
 from seaopt.machine.response.reported import Reported
 from seaopt.machine.response.tripped import Trip
+from seaopt.machine.response.verdicts import LEAST_PHASES
 from seaopt.units import unit_after
 
 EVERY_TICK = "of a log with every n-th tick"
@@ -31,6 +33,21 @@ OPEN = {
     "phases": "dry friction folds into its lines; play six sets of random phases, or log every tick",
     "aliases": "lines of the reference above half of the log's rate come back as others; play slower ones, or log "
     "every tick",
+}
+BREAKS = (
+    "{}: {} themselves break the limit as judged, {}, under the reference that was played ({} at worst), so that the "
+    "log cannot tell whether this one keeps it; record a larger amplitude, beside which dry friction is less"
+)
+TURNS = (
+    "stability: under the reference that was played 1 + L of {} turns as that of an unstable loop, too, though theirs "
+    "is stable, so that the log cannot tell; record a larger amplitude, beside which dry friction is less"
+)
+NOT_TOLD = {
+    "phases": "dry friction folds into the lines of each set of phases, so that the log tells neither whether the "
+    f"machine is another one nor what differs; record {LEAST_PHASES} sets of random phases, with the command below its "
+    "limit",
+    "limit": "in too many periods the command is at its limit, so that the log tells neither whether the machine is "
+    "another one nor what differs; record again at a smaller amplitude, or allow a larger limit",
 }
 UNTOLD = {
     "short, gain": "a law whose {} is half as large",
@@ -155,6 +172,22 @@ def say_status(reported: Reported, row: Replay) -> str:
         return "its status has no fault, though the gate tripped by its readings; look at which status is logged"
     stopped = any(cause.kind == "stopped" for cause in row.causes)
     return fault or ("its status has no fault: a stage ended itself, or a hand stopped it" if stopped else "")
+
+
+def say_certified_break(name: str, row: Judged, machines: str) -> str:
+    """Return that a limit is broken by what was certified, under the reference that was played, and what to record.
+    `machines`: whose worst figure that is.
+    """
+    assert row.certified is not None
+    if row.name == "stability":
+        return TURNS.format(machines)
+    limit, worst = (f"{format_number(value, 3)}{unit_after(row.unit)}" for value in (row.limit, row.certified))
+    return BREAKS.format(name, machines, limit, worst)
+
+
+def say_untold(untold: Untold) -> str:
+    """Return why logs do not tell whether the machine is one of those that were certified, and what to record."""
+    return NOT_TOLD[untold]
 
 
 def say_bias(bias: Bias) -> str:

@@ -219,7 +219,8 @@ def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(p
     stuck = f[np.flatnonzero(tracking < np.sqrt(0.5) * tracking[0])[0]]
     said = format_number(law.measure_states()[" stuck"].bandwidth_hz, 3)
     assert float(said) == pytest.approx(stuck, rel=0.03) and float(said) < 0.7 * 30.0
-    options = {"fractions": (), "limits": {"F1": 600.0}, "certificate": plan.stages[-1].certificate}
+    certificate = replace(plan.stages[-1].certificate, controller=law)  # as if it were certified
+    options = {"fractions": (), "limits": {"F1": 600.0}, "certificate": certificate}
     plan = so.bring_up(law, {"stand": so.plants.high_impedance()}, values, **options)
     both = f"30 Hz sliding and {said} Hz stuck"
     page = write_bring_up_page(plan, tmp_path / "bringup.html").read_text()
@@ -239,6 +240,11 @@ def test_what_cannot_be_played_is_refused(controller, plan):
         ({"fractions": (1.5,)}, "between 0 and 1"),
         ({"share": 0.0}, "share = 0"),
         ({"fractions": (), "bias": 5000.0}, "bias = 5000"),
+        (
+            {"certificate": plan.stages[0].certificate},
+            r"certificate = that of law \w+, 7.5 Hz: the controller is law \w+, ",
+        ),
+        ({"certificate": "robustness.json"}, "certificate = .*give what certify returned"),
         ({"certificate": None, "limits": {"f1": 900.0}}, "limits names f1; known: I, F1"),  # before a law is certified
     ):
         with pytest.raises(so.SeaoptError, match=says):
@@ -252,7 +258,8 @@ def test_sets_of_phases_follow_each_other_smoothly_and_peaks_are_those_of_the_wh
     stand, values = so.plants.high_impedance(), so.plants.thor().update(f_c=300.0, v_s=5e-3)
     law = so.tune(stand, values, so.ControllerSpec(bandwidth_hz=30, max_noise_gain=45, current_limit_A=9.0))
     law = add_compensation(law, friction=CompensateFriction(fraction=0.8))
-    options = {"fractions": (), "limits": {"F1": 600.0}, "certificate": plan.stages[-1].certificate}
+    certificate = replace(plan.stages[-1].certificate, controller=law)  # as if it were certified
+    options = {"fractions": (), "limits": {"F1": 600.0}, "certificate": certificate}
     excitation = so.bring_up(law, {"stand": stand}, values, **options).stages[0].excitation
     period, rows = excitation.waves.shape[1], excitation.reference
     joints = period * (1 + excitation.periods * np.arange(1, len(excitation.waves)))
@@ -312,7 +319,7 @@ def test_with_dry_friction_the_page_does_not_ask_that_logs_lie_in_the_band_of_th
 
     stand, values = so.plants.high_impedance(), so.plants.thor().update(f_c=60.0, v_s=5e-3)
     law = so.tune(stand, values, so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0))
-    certificate = plan.stages[-1].certificate
+    certificate = replace(plan.stages[-1].certificate, controller=law)  # as if it were certified
     rubbing = so.bring_up(law, {"stand": stand}, values, fractions=(), certificate=certificate)
     without, with_ = (write_bring_up_page(each, tmp_path / "bringup.html").read_text() for each in (plan, rubbing))
     assert "must lie" in without and "dry friction" not in without

@@ -145,3 +145,8 @@ def test_a_full_law_without_a_certificate_is_certified_as_the_command_does_it(tm
     full = json.loads(to_json(made[-1].to_dict()))
     assert full["simulation"]["large_signal"]
     assert all(full[part] == certified[part] for part in ("requirements", "plants", "simulation"))
+    (tmp_path / "stand.toml").write_text(SCHEDULED[: SCHEDULED.index("schedule =")].replace("25", "20"))
+    assert seaopt("tune").exit_code == 0
+    refused, count = seaopt("bringup", "--limit", "F1=900"), len(made)
+    assert refused.exit_code == 2 and "robustness.json: is not of controller.json beside it" in refused.output
+    assert len(made) == count  # nothing was certified in its place

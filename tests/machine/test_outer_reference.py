@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,7 +29,8 @@ def certificate(impedance):
 def plan_outer(law, link, certificate, **limits):
     plants = {"stand": law.design[0], "knee": link[0]}
     noise = so.Sensors(noise_std={"tau_s": 0.02, "theta_l": 1e-5})  # that of `run`
-    options = {"fractions": (), "limits": {"tau_s": 40.0, **limits}, "sensors": noise, "certificate": certificate}
+    options = {"fractions": (), "limits": {"tau_s": 40.0, **limits}, "sensors": noise}
+    options["certificate"] = replace(certificate, controller=law)  # as if it were certified
     return so.bring_up(law, plants, link[1], link=link, **options)
 
 

@@ -32,7 +32,7 @@ def test_the_std_has_that_of_what_noise_makes_of_the_model(stage):
         for group in join_blocks([cut_periods(first.controller, ticks)])
     ]
     one = Comparison(controller=first.controller, measured=parts, logs=[shorten(ticks)], names=("tau_s",))
-    settled = one.settle(values)
+    settled = one.settle(values, *one.simulate([values]))
     (model,) = settled.predict([values])
     draws = np.array([one.read(*one.simulate([values], seed)) for seed in range(100, 124)])
     truth, spread = draws.mean(axis=0), np.sqrt(np.var(draws, axis=0, ddof=1) / 4.0)  # of means over four

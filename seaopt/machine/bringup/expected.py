@@ -17,8 +17,10 @@ from seaopt.control.running.closed_loop import LoopRun
 from seaopt.control.scheduling.scheduled_controller import place_variable
 from seaopt.errors import ControlError, suggestion
 from seaopt.machine.bringup.excitation import Excitation, design_excitation
+from seaopt.machine.bringup.predicted import find_share, list_broken, predict_played
 from seaopt.machine.design_run import run_design
 from seaopt.machine.response.enclosed import enclose_outer
+from seaopt.machine.response.judged import Prediction
 from seaopt.machine.response.verdicts import LEAST_PHASES, AgainstFriction, find_friction, has_dry_friction
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -70,6 +72,12 @@ class Expected(AgainstFriction):
         played, by simulation.
     friction : float or None
         The effort that dry friction takes: below it the motor does not move.
+    prediction : Prediction or None
+        Of a plant with dry friction: what it and draws of it do under this reference, as acceptance will judge its log;
+        None with an outer loop.
+    enough : float or None
+        Where these break a limit of the law themselves: the share of the limits of command, travel and force at which
+        they keep it; None where none does.
     """
 
     controller: Controller
@@ -81,6 +89,13 @@ class Expected(AgainstFriction):
     stop: Mapping[str, float]
     effort: float | None = None
     friction: float | None = None
+    prediction: Prediction | None = None
+    enough: float | None = None
+
+    @property
+    def broken(self) -> tuple[str, ...]:
+        """The figures whose limits certified machines break themselves under this reference."""
+        return () if self.prediction is None else tuple(list_broken(self.controller, self.prediction))
 
     @property
     def unit(self) -> str:
@@ -128,7 +143,7 @@ def expect(
     """
     shown = controller if shown is None else shown
     runs = replace(controller, outer=None) if runs is None else runs  # a stage is of the force law alone
-    excitation, effort, friction = _excite(controller, runs, per_given, options)
+    excitation, fields = _excite(controller, runs, per_given, draws, options)
     assert controller.design is not None
     plant, values = controller.design
     loops = [shown.close(plant, each) for each in (values, *(place_values(plant, values, each) for each in draws))]
@@ -144,8 +159,7 @@ def expect(
         "step": _band(controller.sample_time_s * np.arange(steps.shape[1]), steps),
         "step_size": None if limit is None else float(limit / controller.per_effort / np.max(np.abs(efforts))),
         "stop": {key: min(STOP * peak, excitation.limits.get(key, np.inf)) for key, peak in excitation.peaks.items()},
-        "effort": effort,
-        "friction": friction,
+        **fields,
     }
 
 
@@ -211,10 +225,15 @@ def expect_outer(
 
 
 def _excite(
-    controller: Controller, runs: Controller, per_given: float, options: Mapping[str, Any]
-) -> tuple[Excitation, float | None, float | None]:
-    """Return the reference of a stage; of a plant with dry friction the effort that it makes and the friction, with an
-    amplitude that moves the motor where the largest share of the limits, "most", allows it.
+    controller: Controller,
+    runs: Controller,
+    per_given: float,
+    draws: Sequence[Mapping[str, float]],
+    options: Mapping[str, Any],
+) -> tuple[Excitation, dict[str, Any]]:
+    """Return the reference of a stage; of a plant with dry friction the effort that it makes, the friction, and what
+    certified machines do under it, with an amplitude that moves the motor, and at which they keep the limits of the
+    law, where the largest share of the limits, "most", allows it.
     """
     dry = has_dry_friction(controller)
     given: dict[str, Any] = {key: options[key] for key in ("bias", "limits", "seed")}
@@ -230,6 +249,10 @@ def _excite(
         peaks = _add_noise(controller, runs, _scale(excitation, per_given), options["sensors"])
         return peaks if run is None else _take_larger(peaks, {**run.outputs, command: run.current})
 
+    def keeps(share: float) -> bool:
+        excitation = design_excitation(controller, share=share, **given)
+        return not list_broken(controller, predict_played(controller, excitation, draws, options["sensors"]))
+
     limit, command = controller.command_limit, controller.command.input
     excitation, run, effort = play(share)
     for _ in range(RAISES):
@@ -237,6 +260,13 @@ def _excite(
             break
         share = min(share * max(MOVES * friction / max(effort, 1e-12), ONWARD), most)
         excitation, run, effort = play(share)
+    enough = None
+    predicts = dry and runs.outer is None
+    if predicts and not keeps(share):
+        enough = find_share(keeps, share, most)
+        if enough is not None and enough <= most:
+            share = enough
+            excitation, run, effort = play(share)
     peaks = find_peaks(excitation, run)
     for _ in range(LOWERS):  # a period in which the command is at its limit is lost for the response
         if limit is None or peaks[command] < ROOM * limit:
@@ -244,7 +274,11 @@ def _excite(
         share *= LESS
         excitation, run, effort = play(share)
         peaks = find_peaks(excitation, run)
-    return replace(excitation, peaks=peaks), effort, friction if dry else None
+    fields: dict[str, Any] = {"effort": effort, "friction": friction if dry else None}
+    if predicts:
+        fields["prediction"] = predict_played(controller, excitation, draws, options["sensors"])
+        fields["enough"] = enough if enough is not None and enough > most else None
+    return replace(excitation, peaks=peaks), fields
 
 
 def _scale(excitation: Excitation, per_given: float) -> Excitation:

@@ -13,7 +13,7 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup.expected import Band, Expected, OuterExpected
 from seaopt.machine.bringup.stages import BringUp, Stage
-from seaopt.machine.response.verdicts import find_friction, has_dry_friction
+from seaopt.machine.response.verdicts import find_friction, has_dry_friction, list_limits
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
@@ -49,6 +49,13 @@ STILL = (
     "the first that moves."
 )
 MOVED = "Its effort swings by {} at most, and dry friction holds {}: the motor moves."
+UNDER = (
+    "Under this reference the model has {}, simulated with its dry friction; with that seaopt accept compares the log."
+)
+BREAKS = "ITS LOG CANNOT CONFIRM {}: at this amplitude, beside dry friction, certified machines break {} themselves. {}"
+ENOUGH = "Plan it again with --share {}, at which they keep all limits."
+NO_SHARE = "No amplitude that was tried within the limits of command, travel and force avoids it; raise these limits."
+UNTOLD = "{} cannot be confirmed in {}: see there."
 HELD = "No motion is expected in {}: dry friction holds the motor there."
 NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
 
@@ -123,7 +130,8 @@ def describe(result: BringUp) -> list[Section]:
     last = result.stages[-1].controller
     outer = () if last.outer is None else (_say_outer(result.stages, last.outer),)
     still = [stage.name for stage in result.stages if stage.still]
-    held = (HELD.format(join_words(still)),) if still else ()
+    held = [HELD.format(join_words(still))] if still else []
+    held += [UNTOLD.format(join_words(stage.broken), stage.name) for stage in result.stages if stage.broken]
     overview = Section(
         title="Stages",
         part="stages",
@@ -156,6 +164,27 @@ def _say_whether_it_moves(stage: Expected) -> tuple[str, ...]:
     unit = unit_after(stage.controller.command.effort_unit)
     sizes = (f"{format_number(value, 3)}{unit}" for value in (stage.effort, stage.friction))
     return ((STILL if stage.still else MOVED).format(*sizes),)
+
+
+def say_prediction(stage: Expected) -> tuple[str, ...]:
+    """Return what the model does under a stage's own reference beside the limits, and which it breaks."""
+    if stage.prediction is None:
+        return ()
+    figures, peaks, limits = stage.prediction.figures, stage.prediction.peaks, list_limits(stage.controller)
+    parts = [
+        f"{name} {format_number(figures.get(name), 3)} ({format_number(peaks[name], 3)} at worst, "
+        f"{format_number(limit, 3)} allowed)"
+        for name, limit in limits.items()
+    ]
+    bandwidth, asked = (
+        format_number(value, 3) for value in (figures.get("bandwidth"), stage.controller.spec.bandwidth_hz)
+    )
+    said = UNDER.format(join_words([*parts, f"a bandwidth of {bandwidth} Hz ({asked} Hz asked of it as it slides)"]))
+    if not stage.broken:
+        return (said,)
+    remedy = NO_SHARE if stage.enough is None else ENOUGH.format(format_number(stage.enough, 2))
+    limit = "that limit" if len(stage.broken) == 1 else "those limits"
+    return said, BREAKS.format(join_words(stage.broken), limit, remedy)
 
 
 def _list_row(stage: Stage) -> tuple[Any, ...]:
@@ -191,6 +220,7 @@ def _describe_stage(stage: Stage) -> Section:
         f"Expect: a step of the reference{_say_size(stage)} peaks at {_say_top(stage)} of its size "
         f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
         *_say_whether_it_moves(stage),
+        *say_prediction(stage),
         *_explain_friction(controller),
     ]
     return Section(

@@ -11,7 +11,7 @@ from seaopt.codec import to_content
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
-from seaopt.machine.acceptance import list_draws
+from seaopt.machine.acceptance import hash_source, list_draws
 from seaopt.machine.bringup.expected import (
     BARELY,
     MOVES,
@@ -24,13 +24,13 @@ from seaopt.machine.bringup.expected import (
     find_noise,
     split_limits,
 )
-from seaopt.machine.response.verdicts import find_friction
+from seaopt.machine.response.verdicts import find_friction, list_limits
 from seaopt.machine.stepped import Source, Spec, change_plan, limit_spec, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
 from seaopt.records import Result, Worded, record
-from seaopt.robustness import Certificate, certify, tune_certified
+from seaopt.robustness import Certificate, certify, linear_controller, tune_certified
 from seaopt.signals import REFERENCE
 
 BRINGUP_SCHEMA = "seaopt/bringup/1"
@@ -120,6 +120,13 @@ def _describe(stage: Stage) -> dict[str, Any]:
     }
 
 
+def _describe_prediction(expected: Expected) -> dict[str, Any] | None:
+    if expected.prediction is None:
+        return None
+    limits = {"limits": list_limits(expected.controller), "broken": expected.broken, "enough_share": expected.enough}
+    return to_content(expected.prediction) | limits
+
+
 def _describe_played(expected: Expected) -> dict[str, Any]:
     excitation = expected.excitation
     return {
@@ -133,6 +140,7 @@ def _describe_played(expected: Expected) -> dict[str, Any]:
             "frequency_hz": excitation.frequency_hz,
         },
         "friction": expected.motion,
+        "under_reference": _describe_prediction(expected),
         "peaks": excitation.peaks,
         "limits": excitation.limits,
         "stop": expected.stop,
@@ -190,7 +198,7 @@ def bring_up(
         The plant whose link the law's outer loop moves, with its values, as in `accept`: the full law then has a
         reference for that loop, too.
     certificate : Certificate, optional
-        Of the full law, where there is one.
+        Of the full law, where there is one: what `certify` returned for this very controller.
     tune_stage, certify_stage : callable, optional
         How the law at a fraction of the bandwidth is tuned, and how a stage's law is certified, where more than plants
         and ranges count.
@@ -208,7 +216,8 @@ def bring_up(
     Raises
     ------
     ControlError
-        The controller does not know its design plant, nothing is limited, or an argument is out of range.
+        The controller does not know its design plant, nothing is limited, the certificate is of another law, or an
+        argument is out of range.
 
     Examples
     --------
@@ -229,6 +238,8 @@ def bring_up(
             raise ControlError(f"fractions has {fraction:g}, which is not between 0 and 1; give such as (0.25, 0.5)")
     if not 0.0 < require_number(share, "share", ControlError) <= 1.0:
         raise ControlError(f"share = {share:g} is not between 0 and 1; give the part of each limit to use: 0.5")
+    if certificate is not None:
+        _require_same_law(controller, certificate)
 
     def certify_one(law: Any) -> Certificate:
         full = law is controller  # else no curve of which nothing is required, and what takes long until it fails
@@ -287,6 +298,20 @@ def bring_up(
             stage = replace(stage, around=expect_outer(stage.controller, outer, enclosed, draw(enclosed), part))
         keep(stage)
     return BringUp(stages=tuple(stages))
+
+
+def _require_same_law(source: Source, certificate: Certificate) -> None:
+    """Raise ControlError where a certificate is of another law."""
+    require_type(certificate, Certificate, "certificate", "give what certify returned", ControlError)
+    law = linear_controller(source) if isinstance(source, ForceMPC) else source
+    certified = certificate.controller if certificate.schedule is None else certificate.schedule
+    ours, theirs = hash_source(law), hash_source(certified)
+    if ours != theirs:
+        raise ControlError(
+            f"certificate = that of law {theirs}, {certified.spec.bandwidth_hz:g} Hz: the controller is law {ours}, "
+            f"{source.spec.bandwidth_hz:g} Hz; give what certify(controller, ...) returns, or leave it out, and it is "
+            "certified"
+        )
 
 
 def slow_down(spec: Spec, fraction: float) -> Spec:

@@ -7,6 +7,11 @@ where it does least, takes a line further than that: one size out of all lines t
 The nearest draw is the one of the least misfit, sum over the lines of the square of what it is off by, over the
 measurement's std.
 
+With dry friction a log of fewer than six sets of phases that is off does not tell, but where one cause explains it:
+friction folds into the lines of each set, which the noise from period to period says nothing of, so that a right
+machine may be off by more than that. Nor does one many of whose periods had the command at its limit: what is left
+comes right after such a period, in which the loop was open.
+
 A sensor is at its range where readings pile up at an edge of what was read while the command moves on.
 """
 
@@ -14,19 +19,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt.control import Controller
 from seaopt.machine.differences.comparison import TOLERATED, Comparison, Lines
-from seaopt.machine.differences.explanations import explain
+from seaopt.machine.differences.explanations import WORTH, explain
 from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.response.judged import Measured, Prediction
 from seaopt.machine.response.periods import shorten
-from seaopt.machine.response.verdicts import has_dry_friction, predict_response
+from seaopt.machine.response.verdicts import LEAST_PHASES, has_dry_friction, predict_response
 from seaopt.machine.ticks import Ticks, find_edges
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
@@ -34,14 +40,17 @@ from seaopt.robustness.uncertainty.worst import place_values
 
 SIMULATED = 60  # draws that are simulated, with dry friction
 MOVES = 0.5  # of the rows in which a reading stays at an edge: the command is another than in the one before
+EXPLAINED = 0.95  # of the difference, from which on one cause is what differs
+MOST_LIMITED = 0.25  # of the periods, that may have the command at its limit
 Values = Mapping[str, float]
+Untold = Literal["", "phases", "limit"]
 
 
 @record
 class Differences:
     """How the measured plant differs from the certified one."""
 
-    inside: bool  # the machine is one of those that were certified
+    inside: bool  # the machine is one of those that were certified; not so where the log does not tell
     each_line: bool  # each line by itself is within reach of them
     misfit: float  # mean square of the difference over its std; 1 is noise
     most_noise: float  # of such a one that noise leaves of a right model, 95 %
@@ -51,6 +60,9 @@ class Differences:
     nearest: Mapping[str, float]  # of the certificate's draws, the values of the one that is nearest
     nearest_misfit: float | None
     prediction: Prediction | None = None  # with dry friction
+    # Why the log tells neither whether the machine is inside nor what differs: too few sets of phases for dry friction,
+    # or too many periods in which the command is at its limit.
+    untold: Untold = ""
 
     @property
     def explained(self) -> bool:
@@ -76,14 +88,15 @@ def compare(
     # Without a stiffness the link's place, which the enclosed law reads, drifts.
     names = controller.signals if apart is None or apart.renders else apart.signals
     comparison = Comparison(controller=controller, measured=measured, logs=logs_taken, names=names, apart=apart)
+    comparison = comparison.listen() if dry else comparison
     beside = replace(comparison, names=_list_beside(measured, controller.signals))
     plant, values = controller.design
     nominal = plant.complete(values)
     response, count = comparison.response, comparison.f.size
     draws = draws[:SIMULATED] if dry else draws
     sets = [values, *(place_values(plant, values, draw) for draw in draws)]
-    comparison = comparison.settle(values) if dry else comparison
     simulated = comparison.simulate(sets) if dry else []
+    comparison = comparison.settle(values, simulated[0]) if dry else comparison
     drawn = [*map(comparison.read, simulated)] if dry else comparison.predict(sets)
     model, drawn = drawn[0], np.array(drawn[1:]).reshape(-1, count)
     before = comparison.misfit(model)
@@ -93,25 +106,39 @@ def compare(
     flat = [*_list_clipped(controller, [ticks.take(np.flatnonzero(ticks.complete)) for ticks in logs])]
     at = {name: each.value for name, each in nominal.items()}
     spread = take_spread(draws, at)
-    found = [*flat, *explain(comparison, beside, logs, model, spread)]
+    found = explain(comparison, beside, logs, model, spread)
     misfits = [comparison.misfit(row) for row in drawn]
     best = int(np.argmin(misfits)) if misfits else None
     each_line = bool(np.all(share <= TOLERATED))
-    together = is_one_of(comparison, spread, [model, *drawn], 1.0 - confidence) if each_line else False
+    together = each_line and is_one_of(comparison, spread, [model, *drawn], 1.0 - confidence)
     beyond = together and bool(found) and _is_beyond(comparison, values, found[0], model, reach)
+    inside = together and not flat and not beyond
+    explained = bool(found) and found[0].explains >= EXPLAINED and (found[0].left or 0.0) <= WORTH
+    untold = "" if inside or flat or explained else find_untold(controller, measured)
     worst = int(np.argmax(share))
     return Differences(
-        inside=together and not flat and not beyond,
+        inside=inside,
         each_line=each_line,
         misfit=before / count,
         most_noise=comparison.most_noise,
         off=max(float(share[worst]), 0.0),
         off_hz=float(comparison.f[worst]) if share[worst] > TOLERATED else None,
-        found=tuple(found),
+        found=() if untold else (*flat, *found),
         nearest={} if best is None else dict(draws[best]),
         nearest_misfit=None if best is None else misfits[best] / count,
         prediction=predict_response(controller, simulated) if dry else None,
+        untold=untold,
     )
+
+
+def find_untold(controller: Controller, measured: Sequence[Measured]) -> Untold:
+    """Return why logs do not tell whether the machine is one of those that were certified, nor what differs."""
+    if not has_dry_friction(controller):
+        return ""
+    if any(part.phases < LEAST_PHASES for part in measured):
+        return "phases"
+    limited = sum(part.left_out.limit for part in measured)
+    return "limit" if limited > MOST_LIMITED * (limited + sum(part.periods for part in measured)) else ""
 
 
 def _is_beyond(

@@ -54,6 +54,7 @@ class Comparison:
     rate: float = 1.0  # at which the model's law is stepped, over what the clock of the logs says
     simulated: bool = False  # whether the model is, without dry friction too
     apart: Controller | None = None  # the law and its outer loop as they run, where `controller` has both in one
+    shaking: tuple[Sensors | None, ...] | None = None  # of each log, where it was measured: `_find_shaking`
     correction: Lines | float = 1.0  # of the model, from one draw of the noise that shakes it to the mean of several
     scatter: Float[np.ndarray, " m"] | float = 0.0  # std of that mean
 
@@ -126,13 +127,20 @@ class Comparison:
         sampled = sample(seen, law.delay(values), self.names, law.per_effort, *timing)
         return np.concatenate([sampled.responses(self.rate * part.f).ravel() for part in self.measured])
 
-    def settle(self, values: ParameterSet) -> Comparison:
+    def listen(self) -> Comparison:
+        """Return the comparison with the noise of its logs measured, once for all models."""
+        return replace(self, shaking=tuple(map(self._find_shaking, self.logs)))
+
+    def settle(self, values: ParameterSet, first: list[Blocks]) -> Comparison:
         """Return the comparison with the mean of what noise that shakes the machine makes of the model with some
-        values, and how sure that mean is.
+        values, and how sure that mean is. `first`: what is simulated with them, with the noise of seed 0.
         """
-        if all(self._find_shaking(ticks) is None for ticks in self.logs):
+        if self.shaking is None:
+            return self.listen().settle(values, first)
+        if all(each is None for each in self.shaking):
             return self
-        drawn = np.array([self.read(*self.simulate([values], seed)) for seed in range(SHAKEN)])
+        draws = [first, *(self.simulate([values], seed)[0] for seed in range(1, SHAKEN))]
+        drawn = np.array([*map(self.read, draws)])
         mean, std = np.mean(drawn, axis=0), np.sqrt(np.var(drawn, axis=0, ddof=1) / SHAKEN)
         return replace(self, correction=self.correction * mean / drawn[0], scatter=std)
 
@@ -143,16 +151,24 @@ class Comparison:
         source, share = replace(self.controller, outer=None), 1.0  # what was given is the force law's reference
         if self.apart is not None and self.apart.outer is not None:
             source, share = replace(self.apart, design=source.design), 1.0 / self.apart.outer.per_given
-        runs = [self._run(source, sets, share, ticks, seed) for ticks in self.logs]
+        heard = self.shaking if self.shaking is not None else map(self._find_shaking, self.logs)
+        pairs = zip(self.logs, heard, strict=True)
+        runs = [self._run(source, sets, share, ticks, shaking, seed) for ticks, shaking in pairs]
         return [self._cut(runs, k) for k in range(len(sets))]
 
     def _run(
-        self, source: Controller, sets: Sequence[ParameterSet], share: float, ticks: Ticks, seed: int
+        self,
+        source: Controller,
+        sets: Sequence[ParameterSet],
+        share: float,
+        ticks: Ticks,
+        shaking: Sensors | None,
+        seed: int,
     ) -> Mapping[str, Float[np.ndarray, "runs n"]]:
         """Return the outputs of runs under a share of a log's reference, with the noise of its readings where that
         shakes the motor.
         """
-        every, shaking = count_ticks_per_row(self.controller, ticks), self._find_shaking(ticks)
+        every = count_ticks_per_row(self.controller, ticks)
         reference = share * _fill_ticks(ticks, every)
         if shaking is None:
             alone = run_design(source, sets, reference, rate=self.rate).outputs

@@ -19,6 +19,7 @@ from seaopt.machine.page.verdict import (
     judge,
     list_left_out,
     name_figure,
+    name_machines,
     say_inside,
     say_needed,
     say_undecided,
@@ -30,7 +31,7 @@ from seaopt.machine.response.measured_margins import MARGINS
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import LONGEST, SHORT_BY, Judged, Measured, Response, compares_amplitudes
 from seaopt.machine.ticks import AT_LIMIT, Gaps
-from seaopt.machine.wording import say_bias, say_cause, say_difference, say_status, say_trip
+from seaopt.machine.wording import say_bias, say_cause, say_difference, say_status, say_trip, say_untold
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -145,8 +146,7 @@ def _say_as_played(row: Judged, result: Acceptance) -> str:
     """Return of which bandwidth the row is, and which one was asked."""
     asked = result.controller.spec.bandwidth_hz
     sizes = [f"{format_number(each, 3)} Hz" for each in ((row.limit or 0.0) / (1.0 - SHORT_BY), asked)]
-    machines = "certified machines" if result.certificate == "met" else "machines within the uncertainty that was given"
-    return AS_PLAYED.format(machines, *sizes, _say_reached(row, asked))
+    return AS_PLAYED.format(name_machines(result), *sizes, _say_reached(row, asked))
 
 
 def _say_reached(row: Judged, asked: float) -> str:
@@ -293,7 +293,10 @@ def _describe_differences(result: Acceptance, differences: Differences) -> Secti
     )
     inside, off = say_inside(result, differences), format_number(differences.misfit**0.5, 3)
     sentences = [f"{inside[0].upper()}{inside[1:]}: the measured plant is off by {off} times its noise (rms)."]
-    if differences.each_line and not differences.inside and not any(each.kind == "range" for each in differences.found):
+    if differences.untold:
+        untold = say_untold(differences.untold)
+        sentences.append(f"{untold[0].upper()}{untold[1:]}.")
+    elif differences.each_line and not differences.inside and all(each.kind != "range" for each in differences.found):
         sentences.append(ONE_BY_ONE)
     if differences.nearest:
         nearest = ", ".join(f"{name} {format_number(value)}" for name, value in differences.nearest.items())

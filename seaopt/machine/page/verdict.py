@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from seaopt.formatting import format_count, format_number, join_words
-from seaopt.machine.acceptance import EXPLAINED, Acceptance
+from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.causes import Cause
-from seaopt.machine.differences.certified import Differences
+from seaopt.machine.differences.certified import EXPLAINED, Differences
 from seaopt.machine.differences.comparison import TOLERATED
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.verdicts import LEAST_PHASES, LONGEST, Judged, Response
 from seaopt.machine.wording import (
     say_cause,
+    say_certified_break,
     say_difference,
     say_missing,
     say_position_stays,
     say_status,
     say_trip,
+    say_untold,
 )
 from seaopt.plants.friction import list_friction_parameters
 from seaopt.reporting.sections.data import Commands, Reason, Step, Style, Verdict
@@ -75,7 +77,8 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     if differences is not None and not differences.inside:
         parts.append(say_inside(result, differences))
         first = response is not None and response.rate != 1.0  # by which all figures are other ones
-        reasons.insert(0 if first else len(reasons), Reason(what=_say_best(differences)))
+        said = say_untold(differences.untold) if differences.untold else _say_best(differences)
+        reasons.insert(0 if first else len(reasons), Reason(what=said))
     reasons += undecided  # what differs may be why
     if result.stepped is not None:
         reasons.append(Reason(what=say_difference(result.stepped)))
@@ -96,11 +99,18 @@ def list_left_out(result: Acceptance) -> list[str]:
     return [text for source, text in result.left_out.items() if source not in stay]
 
 
+def name_machines(result: Acceptance) -> str:
+    """Return of which machines the worst is that was predicted under the reference that was played."""
+    return "certified machines" if result.certificate == "met" else "machines within the uncertainty that was given"
+
+
 def say_inside(result: Acceptance, differences: Differences) -> str:
     """Return whether the machine is one of those that were certified, or else of what it was compared with."""
     model = "the plant of the link" if result.enclosed else "the design plant"
     given = "within the uncertainty that was given" if differences.nearest else model
     what = "one of those that were certified" if result.certificate == "met" else given
+    if differences.untold:
+        return f"it is undecided whether the machine is {what}"
     if differences.inside:
         return f"the machine is {what}, to {100.0 * TOLERATED:.0f} % of its response"
     return f"the machine is not {what}"
@@ -132,6 +142,12 @@ def _say_refuted(row: Judged) -> str:
 def say_undecided(result: Acceptance, response: Response) -> str:
     """Return of which limits a log does not say enough, and what to record so that it does."""
     rows = [row for row in response.judged if row.limit is not None and row.outcome == "undecided"]
+    broken = [
+        say_certified_break(name_figure(row), row, name_machines(result)) for row in rows if row.certified is not None
+    ]
+    rows = [row for row in rows if row.certified is None]
+    if broken and not rows:
+        return "; ".join(broken)
     if response.rate != 1.0:  # of these lines no more is needed: they are others once the timer is right
         return f"{join_words([name_figure(row) for row in rows])}: record again once the law is stepped at its rate"
     # a loop that is mended is another one, which other periods decide
@@ -157,7 +173,7 @@ def say_undecided(result: Acceptance, response: Response) -> str:
     wanted = join_words(record) or ("again" if refuted else "more periods, or a larger reference")
     first = "mend what is refuted first, then " if refuted else ""
     others = [f"{join_words([name_figure(row) for row in rows])}: {first}record {wanted}"] if rows else []
-    return "; ".join([*others, *near])
+    return "; ".join([*others, *near, *broken])
 
 
 def _is_clipped(result: Acceptance) -> bool:
@@ -192,6 +208,8 @@ def _say_where(row: Judged) -> str:
 def say_needed(result: Acceptance, row: Judged) -> str:
     """Return what would decide a figure, or tell a margin, in a cell: periods, where they can be recorded."""
     assert result.response is not None
+    if row.certified is not None:
+        return "a larger amplitude"
     if row.periods is None or _is_clipped(result):
         return ""
     if row.periods * result.response.period_s > LONGEST or (row.limit is not None and _rubs(result)):

@@ -36,6 +36,9 @@ class Judged:
     near: float | None = (
         None  # the estimate's distance from the limit, relative, where those periods last over ten minutes
     )
+    # The worst that certified machines have under the reference that was played, where that breaks the limit and is why
+    # the log does not decide; of stability, 0, where their 1 + L turns otherwise than that of a stable model, too.
+    certified: float | None = None
 
     @property
     def told(self) -> bool:
@@ -105,4 +108,6 @@ class Prediction:
     """
 
     figures: Mapping[str, float]  # of the design plant, by their names
+    peaks: Mapping[str, float]  # the largest of them and of those that were drawn, of what has a limit above
     bandwidth_hz: float  # the least of them and of those that were drawn
+    turned: bool  # whether 1 + L of one of these turns otherwise than that of the model, sliding or stuck

@@ -59,6 +59,7 @@ SHORT_BY = 0.1  # of the bandwidth
 CENTRE = 1.0 - 1e-9  # a risk at which discs are points
 MOST_PERIODS = 1e6  # that are counted
 TRACKING = ("reference peak", "bandwidth")
+PEAKS = {"Ms": "max_sensitivity", "Mt": "max_complementary", "reference peak": "max_reference_peak"}
 LONGEST = 600.0  # s: a record that is longer is not asked for
 
 
@@ -247,6 +248,7 @@ def judge_response(
         rows = [row for row in rows if row.name not in TRACKING]
     if prediction is not None:
         rows = [replace(row, predicted=prediction.figures.get(row.name)) for row in rows]
+        rows = [_compare_certified(row, prediction) for row in rows]
     if needs_phases:  # nothing is confirmed, for the discs do not hold the truth
         rows = [_leave_open(row) for row in rows]
     low, high = find_reach(controller)
@@ -282,15 +284,37 @@ def predict_response(controller: Controller, simulated: Sequence[Sequence[Blocks
         [measure(controller, group, by_phases=all(each.realisations >= 2 for each in groups)) for group in groups]
         for groups in simulated
     ]
-    rows = [
-        *_judge_peaks(controller, parts[0], CENTRE),
-        *list_margins(controller, parts[0], CENTRE),
-    ]
+    peaks = [_judge_peaks(controller, part, CENTRE) for part in parts]
+    rows = [*peaks[0], *list_margins(controller, parts[0], CENTRE)]
     bandwidths = [_measure_bandwidth(controller, part) for part in parts]
     figures = {row.name: row.value for row in rows if row.value is not None and math.isfinite(row.value)}
+    largest = {row.name: max(each[k].value or 0.0 for each in peaks) for k, row in enumerate(peaks[0])}
     if math.isfinite(bandwidths[0]):
         figures["bandwidth"] = bandwidths[0]
-    return Prediction(figures=figures, bandwidth_hz=min(bandwidths))
+    turned = any(_compare_turns(controller, part)[0] for part in parts)
+    return Prediction(figures=figures, peaks=largest, bandwidth_hz=min(bandwidths), turned=turned)
+
+
+def list_limits(controller: Controller) -> dict[str, float]:
+    """Return the limits of a loop's peaks as they are judged, with the grace, by the names of their rows."""
+    asked = {name: controller.spec.level(key) for name, key in PEAKS.items()}
+    return {name: (1.0 + GRACE) * limit for name, limit in asked.items() if limit is not None}
+
+
+def _compare_certified(row: Judged, prediction: Prediction) -> Judged:
+    """Return a row whose limit certified machines break themselves under the reference that was played, which refutes
+    this one only where it is beyond theirs.
+    """
+    if row.name == "stability":
+        return (
+            replace(row, outcome="undecided", certified=0.0) if prediction.turned and row.outcome == "refuted" else row
+        )
+    worst = prediction.peaks.get(row.name)
+    if row.limit is None or worst is None or worst <= row.limit or row.outcome == "confirmed":
+        return row
+    if row.outcome == "refuted" and row.low is not None and row.low > (1.0 + GRACE) * worst:
+        return row
+    return replace(row, outcome="undecided", periods=None, certified=worst)
 
 
 def _measure_bandwidth(controller: Controller, measured: Sequence[Measured]) -> float:
@@ -366,7 +390,7 @@ def _compare_turns(controller: Controller, measured: Sequence[Measured]) -> tupl
 
 def _judge_peaks(controller: Controller, measured: Sequence[Measured], alpha: float) -> list[Judged]:
     spec, rows = controller.spec, list[Judged]()
-    ms, mt, peak = (spec.level(name) for name in ("max_sensitivity", "max_complementary", "max_reference_peak"))
+    ms, mt, peak = map(spec.level, PEAKS.values())
     figures = controller.achieved
     rows.append(replace(_judge_sensitivity(ms, measured, alpha), predicted=figures.ms))
     rows.append(replace(_judge_discs("Mt", mt, measured, alpha, _bound_complementary), predicted=figures.mt))
@@ -489,7 +513,8 @@ def _judge_bandwidth(
     that friction makes slower, to that which certified machines have under what was played, where it is known.
     """
     least, stuck = _find_least_bandwidth(controller)
-    played = stuck and prediction is not None
+    slow = prediction is not None and prediction.bandwidth_hz < (1.0 - SHORT_BY) * least
+    played = prediction is not None and (stuck or slow)
     if played and prediction is not None:
         least = min(controller.spec.bandwidth_hz, prediction.bandwidth_hz)
     limit = (1.0 - SHORT_BY) * least
