@@ -126,7 +126,11 @@ def _check_number(name: str, value: Any, entry: OptionField, kind: type, error: 
         raise error(f"{name} = {value!r} is not a {'finite' if kind is float else 'whole'} number; give one{unit}")
     if not entry.option.holds(float(value)):
         usual = isinstance(entry.default, int | float) and not isinstance(entry.default, bool)
-        remedy = f"give {name.rpartition('.')[2]} = {entry.default:g}" if usual else "correct it, or leave it out"
+        remedy = (
+            f"give {(entry.option.key or entry.name).rpartition('.')[2]} = {entry.default:g}"
+            if usual
+            else "correct it, or leave it out"
+        )
         raise error(f"{name} = {value:g} is not {entry.option.describe_range()}; {remedy}")
 
 

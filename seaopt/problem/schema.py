@@ -332,4 +332,9 @@ class ProblemTable(StrictTable):
 
 def json_schema() -> dict[str, Any]:
     """Return the problem file's JSON Schema, for editors, with what each key means."""
-    return ProblemTable.model_json_schema(by_alias=True)
+    schema = ProblemTable.model_json_schema(by_alias=True)
+    for table in (ExpectedControllerTable, ExpectedCertificateTable):  # which are read under older names, too
+        properties, other = schema["$defs"][table.__name__]["properties"], table.model_fields["met"].validation_alias
+        assert isinstance(other, AliasChoices)
+        properties |= {str(name): properties["met"] | {"deprecated": True} for name in other.choices if name != "met"}
+    return schema

@@ -250,6 +250,16 @@ def test_json_schema_is_one():
     json.dumps(schema)
 
 
+@pytest.mark.parametrize(("table", "older"), [("controller", "feasible"), ("certificate", "passed")])
+def test_the_json_schema_knows_the_older_names_of_what_is_expected(table, older):
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = jsonschema.Draft202012Validator(json_schema())
+    content = {"schema": 1, "plant": {"stand": {"kind": "high_impedance"}}}
+    for name in ("met", older):
+        schema.validate(content | {"expect": {table: {name: False}}})
+    assert not schema.is_valid(content | {"expect": {table: {"fine": False}}})
+
+
 def test_import_is_light():
     """`import seaopt` loads no plotting library, no reader, no optimiser."""
     heavy = ("matplotlib", "polars", "control", "pydantic", "scipy", "casadi")
