@@ -148,5 +148,6 @@ def test_a_full_law_without_a_certificate_is_certified_as_the_command_does_it(tm
     (tmp_path / "stand.toml").write_text(SCHEDULED[: SCHEDULED.index("schedule =")].replace("25", "20"))
     assert seaopt("tune").exit_code == 0
     refused, count = seaopt("bringup", "--limit", "F1=900"), len(made)
-    assert refused.exit_code == 2 and "robustness.json: is not of controller.json beside it" in refused.output
+    assert isinstance(refused.exception, so.SeaoptError)
+    assert "robustness.json: is not of controller.json beside it; run seaopt certify" in str(refused.exception)
     assert len(made) == count  # nothing was certified in its place
