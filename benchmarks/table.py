@@ -26,6 +26,7 @@ from typing import Any
 
 # Before NumPy: a second thread on a busy core costs more than it brings.
 os.environ |= {"OPENBLAS_NUM_THREADS": "1", "POLARS_MAX_THREADS": "1"}
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # a process would compile all of seaopt, and not its yardstick
 
 import casadi as ca
 import numpy as np
