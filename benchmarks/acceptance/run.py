@@ -1,6 +1,7 @@
 """Acceptance on machines with faults: accepted rightly, found, named; coverage of the discs. `--seeds N` of each.
 
     python benchmarks/acceptance/run.py --seeds 5 [--on stand knee] [--first 100] [--only FAULT ...] [-o FILE.json]
+    python benchmarks/acceptance/run.py --discs --seeds 60    the discs alone, of the plant whose equations are linear
 
 The machines are those of tests/machine/machine.c, which shares no equation with seaopt, under the exported C: the THOR
 stand with a pid at 30 Hz, and a rotary knee with dry friction at 20 Hz under a pid whose disturbance observer is all
@@ -26,6 +27,9 @@ sys.path.insert(0, str(ROOT))
 
 import seaopt as so  # noqa: E402
 from seaopt.control import Gains  # noqa: E402
+from seaopt.machine.response.periods import cut_periods  # noqa: E402
+from seaopt.machine.response.verdicts import judge_response  # noqa: E402
+from seaopt.machine.ticks import take_ticks  # noqa: E402
 from seaopt.simulation.native import find_compiler  # noqa: E402
 from tests.machine.simulator import Bench, Machine  # noqa: E402
 
@@ -151,13 +155,17 @@ def make_knee():
 SUBJECTS = {"stand": make_stand, "knee": make_knee}
 
 
-def judge(subject, bench, machine, period, rng):
-    """Return the acceptance of a run, and its first name with those that are as good."""
+def record(subject, bench, machine, period, rng):
+    """Return the log of a run, some of them rounded."""
     decimals = int(rng.integers(*subject.decimals, endpoint=True)) if rng.uniform() < 0.5 else None
     reference = subject.stage.excitation.reference
     seed = int(rng.integers(1 << 30))
     log = bench.log(machine, reference, noise=rng.uniform(*subject.noise), seed=seed, period=period, decimals=decimals)
-    log = log.between(float(rng.uniform(0.0, 0.5)), float(log.time[-1]))
+    return log.between(float(rng.uniform(0.0, 0.5)), float(log.time[-1]))
+
+
+def judge(subject, log):
+    """Return the acceptance of a log, and its first name with those that are as good."""
     result = so.accept(
         subject.law, [log], others={OLD: subject.slower}, uncertainty=subject.nominal, ranges=subject.ranges
     )
@@ -168,14 +176,14 @@ def judge(subject, bench, machine, period, rng):
     return result, [(found[0].kind, name) for name in (found[0].name, *found[0].alike)] if found else [()]
 
 
-def cover(result, subject, bench, machine):
+def cover(measured, subject, bench, machine):
     """Return by group how many discs at 95 % hold the loop and the tracking of the machine's own equations, of how
     many. Those of the plant, of 1 + L and of the sensitivity are the loop's.
     """
     from tests.machine.test_response import respond
 
     groups = {}
-    for part in result.response.measured:
+    for part in measured:
         truths = respond(machine, part.f, bench.controller, 1)
         slow, fast = part.f <= subject.spec.bandwidth_hz / 3.0, part.f > 4.0 / 3.0 * subject.spec.bandwidth_hz
         bands = {"slow": slow, "about the bandwidth": ~slow & ~fast, "fast": fast}
@@ -219,7 +227,7 @@ def run_subject(name, options):
         for seed in range(options.first, options.first + options.seeds):
             rng = np.random.default_rng([seed, 7, number])
             key, faulty, period, expected = subject.list_faults(subject.draw(rng))[fault]
-            result, names = judge(subject, subject.benches[key], faulty, period, rng)
+            result, names = judge(subject, record(subject, subject.benches[key], faulty, period, rng))
             right = any(each in expected for each in names)
             found, named = found + (not result.met), named + right
             if expected and not right:
@@ -227,18 +235,40 @@ def run_subject(name, options):
             if not expected and not result.met:
                 otherwise.append(f"{seed}: {result!r}")
             if fault in LINEAR and not faulty.coulomb and result.response is not None:
-                for (quantity, band), counts in cover(result, subject, subject.benches[key], faulty).items():
-                    for group in ((quantity, "all"), (quantity, band), (quantity, fault)):
-                        covered[group] = covered.get(group, 0) + counts
+                add_counts(covered, fault, cover(result.response.measured, subject, subject.benches[key], faulty))
                 broken, judged = broken + len(find_broken(result, subject.benches[key], faulty)), judged + 5
         table[fault] = {"found": found, "named": named, "of": options.seeds, "otherwise": otherwise}
         counts = f"found {found:3d}/{options.seeds}  named {named:3d}/{options.seeds}"
         print(f"{name:6s} {fault:22s} {counts}  {otherwise}", flush=True)
-    for (quantity, group), (held, count) in covered.items():
-        print(f"discs at 95 % of the {quantity}, {group}: {100.0 * held / count:.1f} % of {count} hold the truth")
+    print_counts(covered)
     if covered:
         print(f"{broken} of {judged} rows refuted wrongly")
     return table
+
+
+def add_counts(covered, fault, counted):
+    """Add the counts of a log to those of its groups."""
+    for (quantity, band), counts in counted.items():
+        for group in ((quantity, "all"), (quantity, band), (quantity, fault)):
+            covered[group] = covered.get(group, 0) + counts
+
+
+def print_counts(covered):
+    for (quantity, group), (held, count) in covered.items():
+        print(f"discs at 95 % of the {quantity}, {group}: {100.0 * held / count:.1f} % of {count} hold the truth")
+
+
+def count_discs(options):
+    """Print how many discs of the stand hold its own equations, without judging its logs."""
+    subject, covered = make_stand(), {}
+    for number, fault in enumerate(subject.list_faults(subject.machine)):
+        for seed in range(options.first, options.first + options.seeds) if fault in LINEAR else ():
+            rng = np.random.default_rng([seed, 7, number])
+            key, faulty, period, _ = subject.list_faults(subject.draw(rng))[fault]
+            log = record(subject, subject.benches[key], faulty, period, rng)
+            response = judge_response(subject.law, [cut_periods(subject.law, take_ticks(subject.law, log))], 0.95)
+            add_counts(covered, fault, cover(response.measured, subject, subject.benches[key], faulty))
+    print_counts(covered)
 
 
 def main():
@@ -247,10 +277,13 @@ def main():
     parser.add_argument("--first", type=int, default=100)
     parser.add_argument("--on", nargs="*", default=list(SUBJECTS), choices=list(SUBJECTS))
     parser.add_argument("--only", nargs="*", default=None)
+    parser.add_argument("--discs", action="store_true")
     parser.add_argument("-o", "--output", type=Path, default=None)
     options = parser.parse_args()
     start = time.process_time()
-    tables = {name: run_subject(name, options) for name in options.on}
+    if options.discs:
+        count_discs(options)
+    tables = {} if options.discs else {name: run_subject(name, options) for name in options.on}
     print(f"{time.process_time() - start:.0f} s of processor time")
     if options.output is not None:
         options.output.write_text(json.dumps(tables, indent=1) + "\n")
