@@ -79,11 +79,13 @@ def describe_value(node: Mapping[str, Any], places: Mapping[str, str]) -> str:
 
 
 def format_rows(table: Mapping[str, Any], places: Mapping[str, str]) -> Iterator[str]:
-    """Yield the rows of a table of keys."""
+    """Yield the rows of a table of keys; not of older names."""
     yield "| key | value | left out | meaning |"
     yield "|---|---|---|---|"
     required = table.get("required", ())
     for key, node in sorted(table["properties"].items(), key=lambda row: row[0] not in required):
+        if node.get("deprecated"):
+            continue
         default = node.get("default")
         left_out = "required" if key in required else ""
         if default not in (None, [], {}) and not isinstance(default, dict):
