@@ -217,7 +217,7 @@ class LoggedPeriods:
         lines.
         """
         blocks = self.blocks
-        off = self.project(shift_command(self.controller, blocks, late).effort - self.made)
+        off = self.project(blocks.effort * self.turn(late) - self.made)
         (count, m), strength = off.shape, np.sqrt(np.mean(np.abs(blocks.reference) ** 2, axis=0))
         normal = off / blocks.reference * strength
         scatter = np.sum(np.abs(normal - np.mean(normal, axis=0)) ** 2, axis=0) / (2.0 * count * (count - 1))
@@ -244,9 +244,9 @@ class LoggedPeriods:
                 commands = self.made * (self.turn(taken - late) - 1.0)
                 yield Shift(kind="late", what="command", commands=commands, value=late, unit="ticks", role="excluded")
 
-    def turn(self, ticks: int) -> Parts:
+    def turn(self, ticks: int) -> Lines:
         """Return what commands so many ticks earlier are multiplied by."""
-        return shift_command(self.controller, replace(self.blocks, effort=np.ones_like(self.made)), ticks).effort
+        return turn_lines(self.controller, self.blocks, ticks)
 
     def list_shifts(self, others: Others, place: float) -> Iterator[Shift]:
         """Yield what may run in place of the law, or stand in its log; `place`: of the variable of a schedule."""
@@ -431,8 +431,13 @@ def find_leakage(law: Law, blocks: Blocks, ticks_per_row: int) -> Float[np.ndarr
 
 def shift_command(controller: Controller, blocks: Blocks, late: int) -> Blocks:
     """Return blocks with the command so many ticks of the law earlier."""
-    turned = np.exp(2j * np.pi * blocks.f * controller.sample_time_s * late)
-    return replace(blocks, effort=blocks.effort * turned)
+    turned = turn_lines(controller, blocks, late)
+    return blocks.change_efforts(lambda each: each.effort * turned)
+
+
+def turn_lines(controller: Controller, blocks: Blocks, ticks: int) -> Lines:
+    """Return what a command so many ticks of the law earlier is multiplied by at each line."""
+    return np.exp(2j * np.pi * blocks.f * controller.sample_time_s * ticks)
 
 
 def is_off(found: Off, shifts: Sequence[Shift], means: Sequence[Lines]) -> bool:

@@ -9,7 +9,7 @@ import pytest
 
 import seaopt as so
 from tests.machine.conftest import FRICTION, make_dry
-from tests.machine.simulator import Machine
+from tests.machine.simulator import Machine, multisine
 
 RIGHT = replace(Machine(), coulomb=FRICTION, smoothing=5e-3)
 
@@ -17,6 +17,10 @@ RIGHT = replace(Machine(), coulomb=FRICTION, smoothing=5e-3)
 @pytest.fixture(scope="module")
 def dry(compiler, tmp_path_factory):
     return make_dry(compiler, tmp_path_factory.mktemp("dry"), periods=8)
+
+
+LINES = np.unique(np.round(np.geomspace(2, 180, 24)).astype(int))
+REFERENCE = multisine(1000, LINES, 30, 60.0, 3, bias=300.0)
 
 
 def keep_every(log, every, first=0):
@@ -49,3 +53,18 @@ def test_friction_that_is_doubled_is_named(dry):
     assert np.isclose(
         dict(zip((first.name, *first.alike), (first.value, *first.alike_values), strict=True))["f_c"], 2.0, rtol=0.1
     )
+
+
+@pytest.mark.parametrize(("delay", "right"), [(0.0, True), (1e-3, False)])
+def test_a_command_that_is_logged_a_tick_late_is_not_the_delay_of_the_machine(controller, bench, delay, right):
+    """A machine with a tick of delay more, whose command is logged as late, looked as the certified one."""
+    log = bench.log(replace(Machine(), delay_s=delay), REFERENCE, noise=0.5)
+    logged = so.Log.from_arrays(
+        time=log.time, source="bench", reference=log["reference"], F1=log["F1"], I=np.r_[0.0, log["I"][:-1]]
+    )
+    result = so.accept(controller, [keep_every(logged, 2)])
+    assert result.replayed and (result.replays[0].ticks_per_row, result.replays[0].command_late) == (2, 1)
+    assert (result.met, result.differences.inside) == (right, right), result
+    if not right:
+        first = result.differences.found[0]
+        assert first.kind == "delay" and np.isclose(first.value, delay, rtol=0.1), result

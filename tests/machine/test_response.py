@@ -88,10 +88,10 @@ def test_a_margin_whose_interval_would_say_nothing_is_not_told_and_what_tells_it
 def test_a_line_at_which_the_effort_is_not_sure_is_the_one_that_decides_with_periods(controller, bench):
     """Its loop gain is small there, so that nothing else leaves Ms open; the std of the mean falls with the root."""
     blocks = cut_periods(controller, take_ticks(controller, bench.log(Machine(), REFERENCE, noise=0.0)))
-    count, effort = len(blocks.effort), blocks.effort.copy()
+    count, added = len(blocks.effort), np.zeros_like(blocks.effort)
     turns = np.exp(2j * np.pi * np.arange(count) / count)  # of no mean
-    effort[:, -1] += turns * np.abs(np.mean(effort[:, -1])) / 2.5 * np.sqrt(count - 1.0)  # 2.5 std of it, of 5 asked
-    changed = replace(blocks, effort=effort, unbroken=None)
+    added[:, -1] = turns * np.abs(np.mean(blocks.effort[:, -1])) / 2.5 * np.sqrt(count - 1.0)  # 2.5 std, of 5 asked
+    changed = blocks.change_efforts(lambda each: each.effort + added)
     (row,) = (row for row in judge_response(controller, [changed], 0.95).judged if row.name == "Ms")
     assert (row.outcome, row.periods, row.where_hz) == ("undecided", 4 * count, blocks.f[-1]) and row.high < row.limit
 

@@ -15,7 +15,7 @@ what its ends add as much as the mean has (Pintelon and Schoukens, System Identi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -104,8 +104,12 @@ class Blocks:
 
     def follow(self, responses: Complex[np.ndarray, "k m"]) -> Blocks:
         """Return the periods with the efforts that a linear law of these responses makes."""
-        unbroken = None if self.unbroken is None else self.unbroken.follow(responses)
-        return replace(self, effort=self.make_efforts(responses), unbroken=unbroken)
+        return self.change_efforts(lambda each: each.make_efforts(responses))
+
+    def change_efforts(self, make: Callable[[Blocks], Complex[np.ndarray, "b m"]]) -> Blocks:
+        """Return the periods with the efforts that are made of them, and so those scattered about each line alone."""
+        unbroken = None if self.unbroken is None else self.unbroken.change_efforts(make)
+        return replace(self, effort=make(self), unbroken=unbroken)
 
     def average(self) -> Blocks:
         """Return one row per stretch, the mean of its periods."""
