@@ -140,6 +140,11 @@ def _read_toml(source: Path) -> dict[str, Any]:
         problem = shlex.quote(str(next(iter(sorted(source.glob("*.toml"))), "problem.toml")))
         folder = f" -o {shlex.quote(str(source))}" if any(source.glob("fit.json")) else ""
         raise ProblemError(f"{error}, the problem's: seaopt run {problem}{folder}") from error
+    if source.suffix.lower() == ".json" and exists(source):
+        folder = shlex.quote(str(source.parent))
+        raise ProblemError(
+            f"{source}: is a result, and no problem file; give that, and the folder of results by -o {folder}"
+        )
     # What is there under another suffix is likely the log itself, which must not be offered as the file to write.
     is_log = source.suffix.lower() != ".toml"
     remedy = "write one from a log: " + shlex.join(

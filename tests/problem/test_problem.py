@@ -176,6 +176,14 @@ def test_mistakes_are_one_clear_line(write, old, new, words):
     assert "problem.toml" in str(raised.value)
 
 
+def test_a_result_in_place_of_the_problem_is_not_to_be_corrected_nor_made_a_problem_of(tmp_path):
+    path = tmp_path / "controller.json"
+    path.write_text("{}", encoding="utf-8")
+    with pytest.raises(so.SeaoptError, match=r"controller\.json: is a result, and no problem file") as raised:
+        so.read_problem(path)
+    assert f"-o {tmp_path}" in str(raised.value) and "seaopt new" not in str(raised.value)
+
+
 @pytest.mark.parametrize("log", ["/etc/passwd", "../secret.csv"])
 def test_logs_stay_in_the_folder(write, log):
     experiment = f"""[[experiment]]

@@ -130,7 +130,7 @@ def _export(stage: Stage, folder: Path, tare: Tare | None, fit_met: bool | None)
         return [export_mpc(source, folder)]
     options: dict[str, Any] = {"log_rows": LOG_ROWS, "tare": tare, "stop": stage.stop}
     if not stage.certificate.met:
-        options["uncertified"] = "the certificate of this stage's law FAILED"
+        options["uncertified"] = "the certificate of the law of this stage FAILED"
     return [*export(source, folder, allow_infeasible=True, fit_met=fit_met, **options)]
 
 
