@@ -12,7 +12,9 @@ import scipy.stats
 import seaopt as so
 from seaopt.machine.bringup.excitation import design_excitation
 from seaopt.machine.design_run import run_design
+from seaopt.machine.page.verdict import say_needed
 from seaopt.machine.response.discs import Ratio
+from seaopt.machine.response.judged import Prediction
 from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import LeftOut, cut_periods, find_period, join_blocks
 from seaopt.machine.response.verdicts import Measured, judge_response, measure
@@ -94,6 +96,20 @@ def test_a_line_at_which_the_effort_is_not_sure_is_the_one_that_decides_with_per
     changed = blocks.change_efforts(lambda each: each.effort + added)
     (row,) = (row for row in judge_response(controller, [changed], 0.95).judged if row.name == "Ms")
     assert (row.outcome, row.periods, row.where_hz) == ("undecided", 4 * count, blocks.f[-1]) and row.high < row.limit
+
+
+@pytest.mark.parametrize("theirs", [1.0, 1.1])
+def test_a_bandwidth_that_certified_machines_have_not_at_the_lowest_line_is_not_confirmed(controller, bench, theirs):
+    """A machine below -3 dB at all lines was confirmed, as none lay below nine tenths of the least bandwidth."""
+    machine = replace(Machine(), per_ampere=0.02 * Machine().per_ampere)
+    assert np.max(np.abs(respond(machine, LINES, controller, 1)[1])) < np.sqrt(0.5)
+    log = bench.log(machine, multisine(1000, LINES, 10, 10.0, 3), noise=0.05)  # whose command is below its limit
+    result, blocks = so.accept(controller, [log]), cut_periods(controller, take_ticks(controller, log))
+    prediction = Prediction(figures={}, peaks={}, bandwidth_hz=theirs * LINES[0], turned=False)
+    response = judge_response(controller, [blocks], 0.95, prediction=prediction)
+    (row,) = (each for each in response.judged if each.name == "bandwidth")
+    assert (row.outcome, row.certified, row.periods) == ("undecided", prediction.bandwidth_hz, None), row
+    assert row.limit == pytest.approx(27.0) and "larger amplitude" in say_needed(result, row)
 
 
 def run_at(bench, machine, rate):

@@ -509,19 +509,16 @@ def _judge_discs(name: str, asked: float | None, measured: Sequence[Measured], a
 def _judge_bandwidth(
     controller: Controller, measured: Sequence[Measured], alpha: float, prediction: Prediction | None
 ) -> Judged:
-    """Judge whether the tracking stays above -3 dB up to the bandwidth that was asked for, less its share; of a plant
-    that friction makes slower, to that which certified machines have under what was played, where it is known.
+    """Judge whether the tracking stays above -3 dB up to the bandwidth that was asked for, less its share, by one line
+    at least; of a plant that friction makes slower, to that which certified machines have under what was played, where
+    it is known.
     """
-    least, stuck = _find_least_bandwidth(controller)
-    slow = prediction is not None and prediction.bandwidth_hz < (1.0 - SHORT_BY) * least
-    played = prediction is not None and (stuck or slow)
-    if played and prediction is not None:
-        least = min(controller.spec.bandwidth_hz, prediction.bandwidth_hz)
+    least, state, certified = _choose_bandwidth(controller, measured, prediction)
     limit = (1.0 - SHORT_BY) * least
     tracked = controller.achieved.bandwidth_hz is not None and controller.achieved.bandwidth_hz < 1e6
     m, bound = sum(part.f.size for part in measured), _bound_tracking(controller)
     values, lows, highs = list[float](), list[float](), list[float]()
-    confirmed, refuted, needed, where = True, False, 0.0, None
+    confirmed, refuted, needed, where = any(np.any(part.f <= limit) for part in measured), False, 0.0, None
     for part in measured:
         below = part.f <= limit
         lower, upper = bound(part, alpha)[0], bound(part, alpha / m)[1]
@@ -536,14 +533,31 @@ def _judge_bandwidth(
         open_ = below & (lower < HALF_POWER)
         room = np.maximum(np.abs(middle - HALF_POWER), 1e-300)
         needed = max(needed, float(np.max(((middle - lower) / room)[open_], initial=0.0)) ** 2 * part.periods)
-    outcome = _decide(confirmed, refuted)
-    high, predicted = min(highs), least if stuck else controller.achieved.bandwidth_hz
+    outcome = _decide(confirmed, refuted) if certified is None else "undecided"
+    high, predicted = min(highs), least if state == "stuck" else controller.achieved.bandwidth_hz
     return Judged(
-        name="bandwidth", state="as played" if played else "stuck" if stuck else "",
+        name="bandwidth", state=state, certified=certified if tracked else None,
         limit=limit if tracked else None, sense="at least", value=min(values), low=min(lows),
         high=high if math.isfinite(high) else None, unit="Hz", outcome=outcome, where_hz=where,
-        periods=_count_periods(outcome, needed), predicted=predicted if tracked else None,
+        periods=_count_periods(outcome, needed if certified is None else 0.0),
+        predicted=predicted if tracked else None,
     )  # fmt: skip
+
+
+def _choose_bandwidth(
+    controller: Controller, measured: Sequence[Measured], prediction: Prediction | None
+) -> tuple[float, str, float | None]:
+    """Return the bandwidth that is judged, and by dry friction of which machine it is; and the least of the certified
+    machines, where that is below the lowest line at an amplitude, so that no line tells whether this one has it.
+    """
+    least, stuck = _find_least_bandwidth(controller)
+    if prediction is None or not (stuck or prediction.bandwidth_hz < (1.0 - SHORT_BY) * least):
+        return least, "stuck" if stuck else "", None
+    asked, theirs = controller.spec.bandwidth_hz, prediction.bandwidth_hz
+    lowest = max(float(part.f[0]) for part in measured)
+    if theirs < (1.0 - SHORT_BY) * asked and lowest > (1.0 - SHORT_BY) * theirs:
+        return asked, "", theirs
+    return min(asked, theirs), "as played", None
 
 
 def _find_least_bandwidth(controller: Controller) -> tuple[float, bool]:
