@@ -194,11 +194,12 @@ def _search_causes(
         named = list(_name_causes(fit, causes, suspects, ended=ended))
         told = all(has_two_amplitudes(fit.logs, e.plant.name) for e in fit.experiments)
         rivals = _list_rivals(causes)
-        refits = [cause.refit for cause in rivals]
-        if refits and all(refits) and (told or not any(cause.material for cause in rivals)):
-            # Hypotheses tell how far the values are off, of a high excess those of logs of both amplitudes: the
+        material = any(cause.material for cause in rivals)
+        if rivals and (not material or (told and all(cause.refit for cause in rivals))):
+            # Causes tell how far the values are off, hypotheses of a high excess those of logs of both amplitudes: the
             # interval has all of them.
-            fit, findings = _reach(fit, findings, error, *(refit.values for refit in refits if refit is not None))
+            others = [cause.problem.unknowns.by_name(cause.z) for cause in rivals]
+            fit, findings = _reach(fit, findings, error, *others)
             named = [replace(each, severity="warning") if each.kind == "cause" else each for each in named]
         findings += named
         search = search if not causes or causes[0].refit is not None else search.yield_to_another()
