@@ -58,4 +58,4 @@ __all__ = [
     "fit",
     "profile",
     "warn_unidentified",
-]  # fmt: skip
+]

@@ -28,4 +28,4 @@ __all__ = [
     "tabulate_actuators",
     "write_actuators",
     "write_fleet_page",
-]  # fmt: skip
+]

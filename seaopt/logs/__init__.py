@@ -31,4 +31,4 @@ __all__ = [
     "read_log",
     "read_table",
     "write_log",
-]  # fmt: skip
+]
