@@ -12,7 +12,7 @@ import numpy as np
 from seaopt.control.mpc.active_set import UNFINISHED
 from seaopt.control.mpc.export import collect_code, list_sources
 from seaopt.control.mpc.mpc import ForceMPC, References
-from seaopt.control.mpc.step import MPCState
+from seaopt.control.mpc.step import MPCState, read_references
 from seaopt.plants.memo import memo
 from seaopt.simulation.native import load_library
 
@@ -76,10 +76,10 @@ def _step_compiled(plan: ForceMPC, library: Any) -> Stepper:
     library.seaopt_plan_reset(memory)
     target, told, most, call = ctypes.c_double(), (ctypes.c_int * 3)(), plan.spec.max_iterations, library.seaopt_plan
     places = (ctypes.c_double * max(len(plan.reads), 1))()
-    pointers = ctypes.byref(target), told
+    pointers, preview = (ctypes.byref(target), told), plan.spec.preview_samples
 
     def step(reference: float | References, measurement: float, readings: Sequence[float]) -> PlanSample:
-        known = np.atleast_1d(np.asarray(reference, dtype=float))
+        known = np.ascontiguousarray(read_references(reference, preview))
         places[: len(readings)] = readings
         command = call(memory, known.ctypes.data, known.size, measurement, places, *pointers)
         solved, iterations, status = told

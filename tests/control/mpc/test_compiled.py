@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from seaopt.control.mpc.compiled import make_stepper
+from seaopt.errors import ControlError
 from tests.control.deploy.test_derating import LIMIT_A
 from tests.control.mpc.test_guarded_mpc import make
 from tests.control.mpc.test_link import LINK, plan
@@ -23,10 +24,22 @@ def compare(mpc, references, readings, places):
     np.testing.assert_allclose(found[:, 0], wanted[:, 0], rtol=0.0, atol=1e-12 * LIMIT_A)
     np.testing.assert_allclose(found[:, 1], wanted[:, 1], rtol=0.0, atol=1e-12 * np.max(np.abs(wanted[:, 1])))
     assert np.array_equal(found[:, [2, 3, 5]], wanted[:, [2, 3, 5]])
-    assert (
-        np.mean(found[:, 4] != wanted[:, 4]) < 0.01
-    )  # of rows that are broken as much rounding decides which is first
+    # Of rows that are broken as much, rounding decides which is first.
+    assert np.mean(found[:, 4] != wanted[:, 4]) < 0.01
     return found
+
+
+def test_references_are_read_as_python_reads_them(compiler):
+    """A column of a table was read along its row; of more than may be known, or of what is no number, all was taken."""
+    mpc = make(preview_samples=3)
+    native, here = make_stepper(mpc), make_stepper(mpc, mpc.start)
+    table = np.column_stack([np.full(4, 100.0), np.full(4, -900.0)])
+    for known in (table[:, 0], table[::2, 0], [100.0, 90], 100):
+        assert native(known, 0.0, []).command == pytest.approx(here(known, 0.0, []).command, abs=1e-12 * LIMIT_A)
+    for step in (native, here):
+        for wrong in (np.full(5, 100.0), [], [100.0, np.nan]):
+            with pytest.raises(ControlError, match="reference_N"):
+                step(wrong, 0.0, [])
 
 
 @pytest.mark.parametrize("options", [{}, {"current_slew_A_per_s": 2000.0, "prefilter": "second_order"}])
