@@ -117,8 +117,16 @@ class Frontier(Result, Worded):
         frontier = cls(**read, controllers=tuple(restore_law(each, plant, params, others, draws) for each in tuned))
         made = to_content(frontier)
         del made["controllers"]  # each has checked itself, to what figures are known to on another machine
+        for row, law in zip(made["rows"], frontier.controllers, strict=True):
+            row |= {"bandwidth_hz": _find_asked_hz(law, row["ms_place"]), "met": law.met}
         check_agrees(content, made, FILE, remedy=SWEEP_AGAIN)
         return frontier
+
+
+def _find_asked_hz(law: Controller | ScheduledController, place: float | None) -> float:
+    """Return the bandwidth that was asked for: of a schedule at one of its places."""
+    asked = law.spec.bandwidth_hz if isinstance(law, Controller) or place is None else law.asked_hz(place)
+    return float(asked)
 
 
 def measure_disturbance(task: Task, law: Law) -> float:

@@ -66,6 +66,8 @@ def test_figures_of_another_machine_are_read_back(content, stand, thor):
         ((), "met", False, "met is False"),
         (("rows", 1), "feasible", True, "rows"),
         (("controllers", 0), "gains", {"k_p": 1.0}, "gains"),
+        (("rows", 0), "bandwidth_hz", 21.0, r"rows\.1\.bandwidth_hz is 21\.0, and the other keys make 20\.0"),
+        (("rows", 1), "met", True, r"rows\.2\.met is True"),
     ],
 )
 def test_a_damaged_sweep_is_refused(content, stand, thor, place, key, value, words):
@@ -83,6 +85,14 @@ def test_a_damaged_sweep_is_refused(content, stand, thor, place, key, value, wor
         Frontier.from_dict(damaged, stand, thor)
 
 
+def test_controllers_of_other_rows_are_refused(content, stand, thor):
+    swapped = seal(content | {"controllers": content["controllers"][::-1]})
+    with pytest.raises(
+        FileError, match=r"rows\.1\.bandwidth_hz is 20\.0, and the other keys make 60\.0; run its sweep again"
+    ):
+        Frontier.from_dict(swapped, stand, thor)
+
+
 def test_a_sweep_of_another_version_is_refused(content, tmp_path):
     path = write_json(tmp_path / "frontier.json", content | {"schema": "seaopt/frontier/9"})
     with pytest.raises(FileError, match=r"frontier\.json: schema is 'seaopt/frontier/9'"):
@@ -95,3 +105,6 @@ def test_a_sweep_of_a_schedule_is_read_back(stand, thor):
     again = Frontier.from_dict(json.loads(to_json(made.to_dict())), stand, thor)
     assert again.over == "k" and again.controllers[0].points == (5e5, 7e5)
     assert repr(again) == repr(made)
+    slower = replace(made.rows[0], bandwidth_hz=0.9 * made.rows[0].bandwidth_hz)
+    with pytest.raises(FileError, match=r"rows\.1\.bandwidth_hz is 27"):
+        Frontier.from_dict(seal(replace(made, rows=(slower,)).to_dict()), stand, thor)
