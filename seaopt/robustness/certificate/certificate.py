@@ -321,7 +321,8 @@ class Certificate(Result, Worded):
         """Return the certificate of a robustness.json; linear figures are computed again, nothing is simulated.
 
         Arguments are those of `certify`; of predictive control, the `plan`, `law` is `linear_controller` of it. Raises
-        FileError: a field is missing or malformed, it was edited or written by hand, or nothing is required in it.
+        FileError: a field is missing or malformed, it was edited or written by hand, nothing is required in it, or it
+        is of predictive control and there is no plan.
         """
         from seaopt.robustness.certificate import stored  # deferred: it reads these
 

@@ -41,6 +41,7 @@ from seaopt.robustness.uncertainty.worst import combine_worst, measure_worst
 from seaopt.robustness.verification.impedance_steps import ImpedanceStep
 from seaopt.robustness.verification.large_signal import LargeSignal
 from seaopt.robustness.verification.limit_cycles import FoundCycle
+from seaopt.robustness.verification.scenarios import WITHIN_LIMIT
 from seaopt.robustness.verification.schedule_motion import Motion
 from seaopt.robustness.verification.schedule_sweep import Sweep
 from seaopt.robustness.verification.verification import Verification, make_rigs
@@ -217,6 +218,7 @@ def _build_one(
     plan: ForceMPC | None = None,
 ) -> Certificate:
     """Return the certificate of what a robustness.json holds of one law."""
+    _check_plan(stored, plan)
     controller, models, parameters = cases.controller, cases.models, cases.unknown.nominal
     varied, names = stored.varied, [row.name for row in stored.varied]
     states = {name: split_states(controller, {name: plant}, parameters, names) for name, plant in models.items()}
@@ -272,6 +274,24 @@ def _build_one(
         raise
     except SeaoptError as error:
         raise FileError(f"{FILE}: {error}; {CERTIFY_AGAIN}") from error
+
+
+def _check_plan(stored: StoredCertificate, plan: ForceMPC | None) -> None:
+    """Refuse a certificate of predictive control without its plan, or whose steps are not of it, and one of a law with
+    a plan.
+    """
+    if stored.constrained is None:
+        if plan is not None:
+            raise FileError(f"{FILE}: is of a law, and not of predictive control; leave out plan, or {CERTIFY_AGAIN}")
+        return
+    if plan is None:
+        raise FileError(f"{FILE}: is of predictive control, whose steps are the plan's; give plan=, the one certified")
+    names = [row["scenario"] for row in stored.steps.get("rows", ())]
+    if names and not any(name.startswith(WITHIN_LIMIT) for name in names):  # sized without a limit
+        raise FileError(
+            f'{FILE}: its steps ("{names[0]}") are of the linear region, as an older seaopt played them, and not of '
+            f"the plan; {CERTIFY_AGAIN}"
+        )
 
 
 def _check_current(name: str, written: Mapping[str, Any], figures: LoopFigures) -> None:

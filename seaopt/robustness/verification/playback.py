@@ -22,6 +22,7 @@ from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.control.running.law_step import find_faults
 from seaopt.control.running.sampled_loop import channel_names, find_longest_delay
 from seaopt.errors import ControlError, StepSizeError, require_memory, require_seed
+from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
 from seaopt.plants.friction import can_stick
@@ -139,8 +140,10 @@ def play(rig: Rig, scenario: Scenario, params: Sequence[ParameterSet], *, seed: 
     scenario's forces counted from the one that keeps it there. A scenario with an `initial_state` starts in that,
     whatever the conditions. `delay_s` among the parameters is a delay besides the controller's. `seed` is of the sensor
     noise and of random excitations. Around an outer loop a force of a phase is the x_0 that its stiffness makes it of;
-    without a stiffness it is added to what that asks for.
+    without a stiffness it is added to what that asks for. Raises ControlError: the rig has a plan, and the scenario is
+    not of forces alone.
     """
+    check_planned(rig.plan, [scenario])
     obstacle = scenario.obstacle(rig.plant, rig.partner)
     if obstacle is not None:
         raise ControlError(f'scenario "{scenario.name}" cannot be played on {rig.plant.name}: {obstacle}')
@@ -155,7 +158,8 @@ def play(rig: Rig, scenario: Scenario, params: Sequence[ParameterSet], *, seed: 
     offset = start.given[:, None] if start is not None and scenario.about_rest else np.zeros((len(params), 1))
     outer = rig.law.outer
     per_force = 1.0 if outer is None else 1.0 / outer.per_given
-    if rig.plan is not None and start is not None:
+    if rig.plan is not None:
+        assert start is not None  # else the scenario is not of forces alone
         return _play_plan(rig, rig.plan, scenario, placed, start, offset, per_force, seed)
     runs: list[LoopRun] = []
     positions: list[RunSamples] = []  # of the link, as the outer loop reads it
@@ -196,6 +200,16 @@ def play(rig: Rig, scenario: Scenario, params: Sequence[ParameterSet], *, seed: 
             positions.append(run.outputs.get(outer.position, np.broadcast_to(still[:, None], run.reference.shape)))
     played = _join_phases(rig, runs, start, tuple(contacts))
     return played if outer is None else replace(played, reference=outer.ask(played.reference, np.hstack(positions)))
+
+
+def check_planned(plan: ForceMPC | None, scenarios: Sequence[Scenario]) -> None:
+    """Refuse scenarios that predictive control cannot be played in (ControlError)."""
+    others = dict.fromkeys(f'"{scenario.name}"' for scenario in scenarios if not scenario.is_of_forces_alone)
+    if plan is not None and others:
+        raise ControlError(
+            f"predictive control is played in forces from rest alone, and {join_words(list(others))} hold, strike or "
+            "load the link, or begin elsewhere; leave them out (scenarios=step_scenarios), or leave out plan"
+        )
 
 
 def _play_plan(

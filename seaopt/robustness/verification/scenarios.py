@@ -31,6 +31,7 @@ LIGHTEST_NS, HEAVIEST_NS = 1e-3, 1e4  # range of blows
 NOMINAL_EFFORT = {LINEAR: 100.0, ROTARY: 1.0}  # where no limit and no friction sizes the steps
 STEP_SHARES = (0.02, 0.1, 0.5)  # of the force that the current limit can hold at rest
 LEAST_STEP = 1e-4  # of the force that the current limit can hold at rest: a smaller one is of a run that diverges
+WITHIN_LIMIT = "unsaturated step"
 UNSATURATED = 0.9  # of the step that just reaches the current limit
 FRICTION_STEPS = (0.2, 1.0, 5.0, 25.0)  # times the dry friction, where there is no limit
 STUCK_STEPS = (0.1, 0.3, 0.7)  # times the friction that holds a joint at rest
@@ -137,6 +138,12 @@ class Scenario:
             word = getattr(self, name)
             if word not in words:
                 raise ControlError(f'scenario "{self.name}": {name} = "{word}" is not known; {suggestion(word, words)}')
+
+    @property
+    def is_of_forces_alone(self) -> bool:
+        """Whether it begins at rest and asks for forces: nothing is held, struck or loaded."""
+        besides = (phase.held or phase.impulse_Ns or phase.scale for phase in self.phases)
+        return not (self.initial_state or any(besides))
 
     def describe_size(self, called: Mechanics = LINEAR) -> str:
         """Return its magnitudes as text: forces (or torques), blows, loads and initial state.
@@ -326,7 +333,7 @@ def _size_steps(controller: Controller) -> dict[str, float]:
     limit, holding = find_step_limit(controller), controller.force_limit(0.0)
     if limit is not None and holding is not None:
         shares = {f"{100 * share:g} % step": share * holding for share in STEP_SHARES}
-        return shares | {"unsaturated step": UNSATURATED * limit}
+        return shares | {WITHIN_LIMIT: UNSATURATED * limit}
     plant, params = _require_design(controller)
     friction = sum(find_dry_friction(plant, plant.complete(params)).values())
     if not friction:

@@ -25,7 +25,7 @@ from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.uncertainty.draws import Plants
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
-from seaopt.robustness.verification.playback import Playback, Rig, play
+from seaopt.robustness.verification.playback import Playback, Rig, check_planned, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
 from seaopt.units import Mechanics
 
@@ -237,7 +237,8 @@ def verify(
     known : Verification, optional
         What was played before: a scenario that it has, on the same rig at the same draws, is not played again.
     plan : ForceMPC, optional
-        Predictive control whose linear region (`linear_controller`) the controller is: it is played in steps.
+        Predictive control whose linear region (`linear_controller`) the controller is: it is played in its place. In
+        forces from rest alone: of the default scenarios those of contact, impact, payload and fall are refused.
     executor : concurrent.futures.Executor, optional
         Where scenarios are played (`seaopt.executors`); here, if left out. The outcomes are the same, bit for bit.
     progress : callable, optional
@@ -250,7 +251,7 @@ def verify(
     Raises
     ------
     ControlError
-        There is no plant, or an argument names an unknown one.
+        There is no plant, or an argument names an unknown one; with a plan, a scenario is not of forces alone.
     SimulationError
         A plant cannot be simulated to the accuracy asked for.
 
@@ -284,6 +285,7 @@ def verify(
                 parts.append((name, scenario, rows))
             else:
                 skipped.append((scenario.name, name, obstacle))
+    check_planned(plan, [scenario for _, scenario, _ in parts])
     names = {name: {scenario.name for plant, scenario, _ in parts if plant == name} for name in rigs}
     play_part = partial(_play_part, Shared((rigs, sets, names, seed)))
     results = map_ordered(play_part, [(name, scenario) for name, scenario, rows in parts if not rows], executor)

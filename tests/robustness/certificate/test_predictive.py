@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import control
 import numpy as np
@@ -21,11 +22,11 @@ from seaopt.control import (
     force_mpc,
     runnable,
 )
-from seaopt.errors import ControlError
-from seaopt.files import to_json
+from seaopt.errors import ControlError, FileError
+from seaopt.files import seal, to_json
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
-from seaopt.robustness import Phase, Scenario, feed_link_forward, linear_controller
+from seaopt.robustness import Phase, Scenario, feed_link_forward, linear_controller, verify
 from seaopt.robustness.certificate import constrained
 from seaopt.robustness.certificate.linear_region import sweep_plans
 from seaopt.robustness.verification import playback
@@ -192,7 +193,8 @@ def test_a_law_whose_estimate_trusts_a_coarse_reading_rings_and_is_not_met(stand
     assert not found.passed and 0 < runs.ringing <= runs.failures
     assert runs.largest_ring > 7.5 and f"{runs.largest_ring:.3g} N" in str(runs)
     assert runs.remedy.startswith("finer sensors") and "does not die out" in runs.text
-    again = so.Certificate.from_dict(json.loads(to_json(found.to_dict())), found.controller, {"stand": stand}, thor)
+    content = json.loads(to_json(found.to_dict()))
+    again = so.Certificate.from_dict(content, found.controller, {"stand": stand}, thor, plan=mpc)
     assert again.constrained == runs and again.runs.rows == found.runs.rows
     ideal = so.certify(mpc, {"stand": stand}, thor, **options)
     assert ideal.passed and ideal.constrained.largest_ring < 0.01
@@ -280,6 +282,42 @@ def test_a_plan_rests_where_a_step_begins(stand, swing, thor, prefilter):
         assert abs(force[0]) == pytest.approx(weight, rel=1e-6)
         np.testing.assert_allclose(force, force[0], atol=1e-3)
         np.testing.assert_allclose(angle, 0.4, atol=1e-6)
+
+
+def test_scenarios_that_no_plan_plays_are_refused(mpc, stand, swing, thor):
+    """They were met: the blow with a peak of 0 N, the fall by the linear law."""
+    law, plants = linear_controller(mpc), {"stand": stand, "swing": swing}
+    named = r'and "impact", "payload", "fall through 90 deg" and "contact" hold, strike or load .*; leave them out'
+    with pytest.raises(ControlError, match=named):
+        verify(law, plants, thor, plan=mpc)
+    rig = make_rigs(law, plants, None, 0.0, plan=mpc)["swing"]
+    push = Phase(duration_s=0.1, force_N=5.0)
+    for phase, state in (
+        ({"impulse_Ns": 0.1}, {}),
+        ({"scale": {"m": 2.0}}, {}),
+        ({"held": True}, {}),
+        ({}, {"phi": 1}),
+    ):
+        other = Scenario(name="other", phases=(push, replace(push, **phase)), initial_state=state)
+        with pytest.raises(ControlError, match='"other" hold, strike or load the link, or begin elsewhere'):
+            play(replace(rig, partner=stand), other, [thor])
+    blow = Scenario(name="blow", phases=(push, replace(push, impulse_Ns=0.1)), on="free")
+    played = verify(law, {"stand": stand}, thor, plan=mpc, scenarios=[Scenario(name="push", phases=(push,)), blow])
+    assert [row.scenario for row in played.rows] == ["push"] and [each[0] for each in played.skipped] == ["blow"]
+
+
+def test_a_file_is_read_with_the_plan_that_it_is_of_alone(certificate, mpc, stand, thor):
+    """Without it, steps were replayed by the linear law; steps that an older seaopt played by that were taken."""
+    content, law = certificate.to_dict(), certificate.controller
+    read = partial(so.Certificate.from_dict, law=law, plants={"stand": stand}, parameters=thor)
+    with pytest.raises(FileError, match=r"is of predictive control, .*; give plan="):
+        read(content)
+    older = json.loads(to_json(certificate.to_dict()))
+    older["steps"]["rows"] = [row | {"scenario": "step"} for row in older["steps"]["rows"] if "2 %" in row["scenario"]]
+    with pytest.raises(FileError, match=r'its steps \("step"\) are of the linear region, .*; certify again'):
+        read(seal(older), plan=mpc)
+    with pytest.raises(FileError, match=r"is of a law, and not of predictive control; leave out plan"):
+        read(seal(json.loads(to_json(content)) | {"constrained": None}), plan=mpc)
 
 
 def test_what_cannot_be_is_said_in_one_line(certificate, mpc, stand, thor):
