@@ -38,6 +38,10 @@ BREAKS = (
     "{}: {} themselves break the limit as judged, {}, under the reference that was played ({} at worst), so that the "
     "log cannot tell whether this one keeps it; record a larger amplitude, beside which dry friction is less"
 )
+NONE_BELOW = (
+    "{}: {} themselves fall below -3 dB at {} under the reference that was played, and none of its lines tells whether "
+    "this one does earlier; record a larger amplitude, beside which dry friction is less"
+)
 TURNS = (
     "stability: under the reference that was played 1 + L of {} turns as that of an unstable loop, too, though theirs "
     "is stable, so that the log cannot tell; record a larger amplitude, beside which dry friction is less"
@@ -182,6 +186,8 @@ def say_certified_break(name: str, row: Judged, machines: str) -> str:
     if row.name == "stability":
         return TURNS.format(machines)
     limit, worst = (f"{format_number(value, 3)}{unit_after(row.unit)}" for value in (row.limit, row.certified))
+    if row.name == "bandwidth":
+        return NONE_BELOW.format(name, machines, worst)
     return BREAKS.format(name, machines, limit, worst)
 
 

@@ -37,7 +37,8 @@ class Judged:
         None  # the estimate's distance from the limit, relative, where those periods last over ten minutes
     )
     # The worst that certified machines have under the reference that was played, where that breaks the limit and is why
-    # the log does not decide; of stability, 0, where their 1 + L turns otherwise than that of a stable model, too.
+    # the log does not decide; of stability, 0, where their 1 + L turns otherwise than that of a stable model, too; of
+    # the bandwidth, where no line lies below.
     certified: float | None = None
 
     @property

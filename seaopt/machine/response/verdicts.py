@@ -278,7 +278,7 @@ def judge_response(
 
 def predict_response(controller: Controller, simulated: Sequence[Sequence[Blocks]]) -> Prediction:
     """Return what machines do under the references that were played. `simulated`: the periods of each, those of the
-    design plant first, without noise.
+    design plant first, with the logs' noise where that shakes the motor through its friction.
     """
     parts = [
         [measure(controller, group, by_phases=all(each.realisations >= 2 for each in groups)) for group in groups]
@@ -548,16 +548,14 @@ def _choose_bandwidth(
     controller: Controller, measured: Sequence[Measured], prediction: Prediction | None
 ) -> tuple[float, str, float | None]:
     """Return the bandwidth that is judged, and by dry friction of which machine it is; and the least of the certified
-    machines, where that is below the lowest line at an amplitude, so that no line tells whether this one has it.
+    machines, where no line of an amplitude lies below, and none tells therefore whether this one has it.
     """
-    least, stuck = _find_least_bandwidth(controller)
+    asked, (least, stuck) = controller.spec.bandwidth_hz, _find_least_bandwidth(controller)
     if prediction is None or not (stuck or prediction.bandwidth_hz < (1.0 - SHORT_BY) * least):
         return least, "stuck" if stuck else "", None
-    asked, theirs = controller.spec.bandwidth_hz, prediction.bandwidth_hz
-    lowest = max(float(part.f[0]) for part in measured)
-    if theirs < (1.0 - SHORT_BY) * asked and lowest > (1.0 - SHORT_BY) * theirs:
-        return asked, "", theirs
-    return min(asked, theirs), "as played", None
+    least = min(asked, prediction.bandwidth_hz)
+    untold = least < asked and any(part.f[0] > (1.0 - SHORT_BY) * least for part in measured)
+    return least, "as played", least if untold else None
 
 
 def _find_least_bandwidth(controller: Controller) -> tuple[float, bool]:
