@@ -32,12 +32,13 @@ MOVED = 0.01  # of an output's spread, by which it has moved
 FOLLOWED = 10.0  # times a sensor's noise, that a residual of a part is at most: 500 samples tell that noise badly
 NOISE = 1.5  # times a sensor's own, that a residual is at most where nothing is wrong
 FAILURES = 7  # of parts to follow, one after the other, that end it
+TRIES = 40  # of parts to follow, in all
 OFF = 1.5  # times the given values, where the first part is begun anew
 
 
 def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | None = None) -> Evaluation | None:
     """Return what is come to from a start over longer and longer parts of the logs, the whole at last; None where a
-    part is not followed, or the whole leaves more than the sensors' noise.
+    part is not followed, it takes too many of them, or the whole leaves more than the sensors' noise.
     """
     unknowns, z = problem.unknowns, start.z
     quiet = [_count_quiet(experiment) for experiment in problem.experiments]
@@ -48,7 +49,9 @@ def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | No
     near = replace(problem, unknowns=replace(unknowns, prior_std=prior_std))
     further = _list_starts(problem, start.z)
     followed, added, failed = 0, SHORTEST, 0
-    while (followed + added) * np.sqrt(2.0) < longest:
+    for _ in range(TRIES):
+        if (followed + added) * np.sqrt(2.0) >= longest:
+            break
         counts = [before + followed + added for before in quiet]
         parts = tuple(e.take_first(count) for e, count in zip(near.experiments, counts, strict=True))
         if not all(np.all(each.count_weighted()) for each in parts):
@@ -65,6 +68,8 @@ def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | No
             added //= 2
         else:
             added, z = SHORTEST, next(further, z)
+    else:
+        return None  # what is added has become little
     if measure_most(problem, z) > NOISE:
         z = settle_roughly(problem, problem.evaluate(z), callback).solution.z
         if measure_most(problem, z) > NOISE:

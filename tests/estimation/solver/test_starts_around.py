@@ -8,6 +8,7 @@ import pytest
 import seaopt as so
 from seaopt.estimation.problem.fit_problem import count_evaluations, pose_problem
 from seaopt.estimation.problem.losses import Squares
+from seaopt.estimation.solver import growing
 
 RATE_HZ, SUBSTEPS, DELAY_S = 1000.0, 100, 0.0013
 K_TAU, N = 0.055, 80.0
@@ -97,6 +98,24 @@ def test_a_joint_that_sticks_is_followed_from_the_first_part_on(seed, seconds, f
         assert fit.nuisance["bench"].delay_s == pytest.approx(DELAY_S, abs=2e-5)
         for name, value in (TRUTH | {"f_c": f_c}).items():
             assert fit.parameters[name].value == pytest.approx(value, rel=2e-3)
+
+
+def test_a_search_over_parts_that_grow_by_little_ends(monkeypatch):
+    """Where 8 samples at most are followed besides, the whole took 260 parts."""
+    bench, known = pose(record(3, 2.0))
+    problem, reached, tries = pose_problem((bench,), known, loss=Squares()), [0], list[int]()
+
+    def follow(part, z, callback):
+        (count,) = (experiment.longest for experiment in part.experiments)
+        tries.append(count)
+        if reached[-1] and count > reached[-1] + 8:
+            return None
+        reached.append(count)
+        return z
+
+    monkeypatch.setattr(growing, "_follow", follow)
+    assert growing.follow_parts(problem, problem.evaluate(problem.unknowns.start)) is None
+    assert len(tries) <= 40 and reached[-1] < 1000
 
 
 def test_a_first_part_is_the_fit_of_a_log_that_ends_there():
