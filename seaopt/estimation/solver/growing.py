@@ -62,7 +62,7 @@ def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | No
             added = min(2 * added, followed)
             continue
         failed += 1
-        if failed == FAILURES:
+        if failed == FAILURES or added == 1:  # half of which adds nothing
             return None
         if followed or failed == 1:
             added //= 2
