@@ -72,23 +72,23 @@ def test_an_earlier_loop_and_another_fault_are_named_together(controller, bench,
     assert f"{abs(1e3 * delay.value):.3g} ms earlier than in the model" in " ".join(str(result).split())
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [18, 20])
 def test_a_small_fault_beside_a_later_loop_is_named(controller, bench, monkeypatch, seed):
     """The delay alone leaves less than twice the noise, and more than noise does of a right model."""
-    log = bench.log(replace(scale(stiffness=0.967), delay_s=1.2e-3), REFERENCE, noise=2.0, seed=seed)
+    log = bench.log(replace(scale(stiffness=0.987), delay_s=1.2e-3), REFERENCE, noise=2.0, seed=seed)
     with monkeypatch.context() as without:
         without.setattr(explanations, "find_pairs", lambda *_: [])
         alone = accept(controller, log).differences
     assert 1.4 < alone.found[0].left < 2.0 and alone.found[0].name == "delay" and not alone.explained
     differences = accept(controller, log).differences
     delay, spring = (find_part(differences.found[0], name)[0] for name in ("delay", "k"))
-    assert delay.low <= 1.2e-3 <= delay.high and spring.low <= 0.967 <= spring.high, differences.found[0]
+    assert delay.low <= 1.2e-3 <= delay.high and spring.low <= 0.987 <= spring.high, differences.found[0]
     assert differences.explained and differences.found[0].left < 1.3
 
 
 def test_a_rest_beyond_noise_says_that_the_interval_may_not_hold(controller, bench):
-    """A fault that is too small to be named leaves 1.68 times the noise, where noise leaves 1.56 with 95 % at most."""
-    log = bench.log(replace(scale(stiffness=0.970), delay_s=1.2e-3), REFERENCE, noise=2.0, seed=3)
+    """A fault that is too small to be named leaves 1.71 times the noise, where noise leaves 1.56 with 95 % at most."""
+    log = bench.log(replace(scale(stiffness=0.984), delay_s=1.2e-3), REFERENCE, noise=2.0, seed=3)
     result = accept(controller, log)
     first = result.differences.found[0]
     assert result.differences.most_noise < first.left < 2.0 and not first.beside
