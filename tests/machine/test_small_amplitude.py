@@ -144,3 +144,20 @@ def test_a_stage_is_played_at_an_amplitude_at_which_the_machine_keeps_its_limits
         options = {"bias": 0.0, "phases": 6, "periods": 3, "limits": {}, "seed": 1}
         larger = design_excitation(bench.controller, share=stage.enough, **options)
         assert measure_sensitivity(bench, machine, larger) < limit
+
+
+def test_a_stage_that_is_lowered_for_the_peak_of_its_command_says_that_this_limit_stands_in_the_way(
+    wrist, compiler, tmp_path
+):
+    """It said that no amplitude avoids it, though one does on the same machine with a larger limit."""
+    bench, machine, _ = wrist
+    law = replace(bench.controller, spec=replace(bench.controller.spec, current_limit_A=0.6))
+    options = {"share": 0.1, "most": 0.95, "bias": 0.0, "limits": {}, "seed": 1}
+    stage = Expected(**expect(law, [], options | {"sensors": so.Sensors(noise_std={"tau_s": NOISE})}))
+    assert stage.lowered and "Ms" in stage.broken and measure_sensitivity(bench, machine, stage.excitation) > 2.1
+    larger = design_excitation(law, share=stage.enough, bias=0.0, phases=6, periods=3, limits={}, seed=1)
+    assert measure_sensitivity(bench, machine, larger) < 2.1
+    log = Bench(compiler, tmp_path, law).log(machine, larger.reference, noise=NOISE)
+    assert np.max(np.abs(log["I"])) > 0.95 * 0.6
+    said = say_prediction(stage)[-1]
+    assert f"At a share of {stage.enough:.2g}" in said and "the limit of the command stands in the way" in said

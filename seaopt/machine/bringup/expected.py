@@ -78,6 +78,8 @@ class Expected(AgainstFriction):
     enough : float or None
         Where these break a limit of the law themselves: the share of the limits of command, travel and force at which
         they keep it; None where none does.
+    lowered : bool
+        Whether that share is not played for the peak of the command, which is at its limit there.
     """
 
     controller: Controller
@@ -91,6 +93,7 @@ class Expected(AgainstFriction):
     friction: float | None = None
     prediction: Prediction | None = None
     enough: float | None = None
+    lowered: bool = False
 
     @property
     def broken(self) -> tuple[str, ...]:
@@ -260,13 +263,13 @@ def _excite(
             break
         share = min(share * max(MOVES * friction / max(effort, 1e-12), ONWARD), most)
         excitation, run, effort = play(share)
-    enough = None
-    predicts = dry and runs.outer is None
-    if predicts and not keeps(share):
-        enough = find_share(keeps, share, most)
-        if enough is not None and enough <= most:
+    enough, predicts = None, dry and runs.outer is None
+    if predicts:
+        enough = share if keeps(share) else find_share(keeps, share, most)
+        if enough is not None and share < enough <= most:
             share = enough
             excitation, run, effort = play(share)
+    chosen = share
     peaks = find_peaks(excitation, run)
     for _ in range(LOWERS):  # a period in which the command is at its limit is lost for the response
         if limit is None or peaks[command] < ROOM * limit:
@@ -277,7 +280,8 @@ def _excite(
     fields: dict[str, Any] = {"effort": effort, "friction": friction if dry else None}
     if predicts:
         fields["prediction"] = predict_played(controller, excitation, draws, options["sensors"])
-        fields["enough"] = enough if enough is not None and enough > most else None
+        if enough is not None and list_broken(controller, fields["prediction"]):
+            fields |= {"enough": enough, "lowered": share < chosen}
     return replace(excitation, peaks=peaks), fields
 
 

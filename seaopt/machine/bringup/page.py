@@ -55,6 +55,10 @@ UNDER = (
 BREAKS = "ITS LOG CANNOT CONFIRM {}: at this amplitude, beside dry friction, certified machines break {} themselves. {}"
 ENOUGH = "Plan it again with --share {}, at which they keep all limits."
 NO_SHARE = "No amplitude that was tried within the limits of command, travel and force avoids it; raise these limits."
+LOWERED = (
+    "At a share of {} they keep all, but the limit of the command stands in the way: its peak comes to it there, "
+    "and such periods are lost. Raise that limit."
+)
 UNTOLD = "{} cannot be confirmed in {}: see there."
 HELD = "No motion is expected in {}: dry friction holds the motor there."
 NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
@@ -182,7 +186,9 @@ def say_prediction(stage: Expected) -> tuple[str, ...]:
     said = UNDER.format(join_words([*parts, f"a bandwidth of {bandwidth} Hz ({asked} Hz asked of it as it slides)"]))
     if not stage.broken:
         return (said,)
-    remedy = NO_SHARE if stage.enough is None else ENOUGH.format(format_number(stage.enough, 2))
+    remedy = NO_SHARE
+    if stage.enough is not None:
+        remedy = (LOWERED if stage.lowered else ENOUGH).format(format_number(stage.enough, 2))
     limit = "that limit" if len(stage.broken) == 1 else "those limits"
     return said, BREAKS.format(join_words(stage.broken), limit, remedy)
 

@@ -123,8 +123,9 @@ def _describe(stage: Stage) -> dict[str, Any]:
 def _describe_prediction(expected: Expected) -> dict[str, Any] | None:
     if expected.prediction is None:
         return None
-    limits = {"limits": list_limits(expected.controller), "broken": expected.broken, "enough_share": expected.enough}
-    return to_content(expected.prediction) | limits
+    limits = {"limits": list_limits(expected.controller), "broken": expected.broken}
+    share = {"enough_share": expected.enough, "lowered": expected.lowered}
+    return to_content(expected.prediction) | limits | share
 
 
 def _describe_played(expected: Expected) -> dict[str, Any]:
