@@ -67,6 +67,11 @@ def measure_excess(problem: FitProblem, z: Vector) -> dict[str, float]:
     return list_excess(problem, measure_floors(problem, compute_residuals(problem, z), z))
 
 
+def measure_most(problem: FitProblem, z: Vector) -> float:
+    """Return how many times its sensor's noise a residual is at most."""
+    return max(measure_excess(problem, z).values())
+
+
 def list_excess(problem: FitProblem, floors: Mapping[str, NoiseFloor]) -> dict[str, float]:
     """Return the excess of each output, by EXPERIMENT.OUTPUT."""
     return {output.label: float(floors[output.experiment.name].excess[output.index]) for output in problem.outputs}

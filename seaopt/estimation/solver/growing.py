@@ -21,8 +21,9 @@ import numpy as np
 
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
-from seaopt.estimation.problem.noise_floor import measure_excess
+from seaopt.estimation.problem.noise_floor import measure_most
 from seaopt.estimation.problem.shapes import Vector
+from seaopt.estimation.problem.unknowns import Unknowns
 from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.loosening import loosen_start
 from seaopt.estimation.solver.settle import settle_roughly
@@ -47,7 +48,7 @@ def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | No
     size[: unknowns.shared] = np.abs(unknowns.start[: unknowns.shared])
     prior_std = np.minimum(unknowns.prior_std, np.where(size > 0.0, size, np.inf))
     near = replace(problem, unknowns=replace(unknowns, prior_std=prior_std))
-    further = _list_starts(problem, start.z)
+    further = list_starts(unknowns, start.z, OFF, np.random.default_rng(0))
     followed, added, failed = 0, SHORTEST, 0
     for _ in range(TRIES):
         if (followed + added) * np.sqrt(2.0) >= longest:
@@ -97,25 +98,14 @@ def _count_quiet(experiment: FitExperiment) -> int:
     return experiment.weights.settle + first
 
 
-def _list_starts(problem: FitProblem, z: Vector) -> Iterator[Vector]:
-    """Yield starts around values."""
-    unknowns = problem.unknowns
-    for ways in list_ways(unknowns.shared, np.random.default_rng(0)):
-        around = z.copy()
-        around[: unknowns.shared] *= OFF**ways
-        yield np.clip(around, unknowns.low, unknowns.high)
-
-
-def list_ways(count: int, rng: np.random.Generator) -> Iterator[Vector]:
-    """Yield ways to move so many values, up or down, and the next with all ways turned."""
-    ways, tried = np.ones(count), set[tuple[float, ...]]()
+def list_starts(unknowns: Unknowns, z: Vector, factor: float, rng: np.random.Generator) -> Iterator[Vector]:
+    """Yield starts around values: each shared one moved by a factor, up or down, and in the next the other way."""
+    count, tried = unknowns.shared, set[tuple[float, ...]]()
+    ways = np.ones(count)
     while len(tried) < 2**count:
         ways = -ways if len(tried) % 2 else rng.choice([-1.0, 1.0], count)
         if tuple(ways) not in tried:
             tried.add(tuple(ways))
-            yield ways
-
-
-def measure_most(problem: FitProblem, z: Vector) -> float:
-    """Return how many times its sensor's noise a residual is at most."""
-    return max(measure_excess(problem, z).values())
+            around = z.copy()
+            around[:count] *= factor**ways
+            yield np.clip(around, unknowns.low, unknowns.high)

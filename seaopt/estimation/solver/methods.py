@@ -12,7 +12,7 @@ import numpy as np
 from seaopt.errors import EstimationError, require_seed
 from seaopt.estimation.problem.experiment import check_shots
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
-from seaopt.estimation.problem.noise_floor import measure_excess
+from seaopt.estimation.problem.noise_floor import measure_most
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.solver.delay_cells import shift_start
@@ -291,7 +291,7 @@ def _approach_sticking(
     many minima, none of which explains it: a search that went all the way would creep.
     """
     roughly, finite = name_phase(callback, "looking for a start"), bool(np.isfinite(start.cost))
-    if finite and max(measure_excess(problem, start.z).values()) > LOST:
+    if finite and measure_most(problem, start.z) > LOST:
         followed = follow_parts(problem, start, roughly)
         if followed is not None:
             return followed, 0

@@ -20,8 +20,9 @@ from itertools import islice
 import numpy as np
 
 from seaopt.estimation.problem.fit_problem import FitProblem
+from seaopt.estimation.problem.noise_floor import measure_most
 from seaopt.estimation.problem.normal_equations import invert
-from seaopt.estimation.solver.growing import NOISE, list_ways, measure_most
+from seaopt.estimation.solver.growing import NOISE, list_starts
 from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.settle import Solved, settle, settle_roughly
 
@@ -45,10 +46,9 @@ def search_around(solved: Solved, seed: int, max_iterations: int, callback: Call
         return solved
     callback, rng, best = name_phase(callback, "another start"), np.random.default_rng(seed), solved
     held = _hold_delays(problem) if lost else problem
-    for ways in islice(list_ways(count, rng), STARTS):
-        start = unknowns.start.copy() if lost else z.copy()
-        start[:count] = unknowns.start[:count] * OFF**ways
-        rough = settle_roughly(held, held.evaluate(np.clip(start, unknowns.low, unknowns.high)), callback)
+    given = unknowns.start if lost else np.append(unknowns.start[:count], z[count:])
+    for start in islice(list_starts(unknowns, given, OFF, rng), STARTS):
+        rough = settle_roughly(held, held.evaluate(start), callback)
         if lost:
             rough = settle_roughly(problem, problem.evaluate(rough.solution.z), callback)
         best = min(best, rough, key=lambda each: each.misfit)
