@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -252,9 +253,13 @@ def _excite(
         peaks = _add_noise(controller, runs, _scale(excitation, per_given), options["sensors"])
         return peaks if run is None else _take_larger(peaks, {**run.outputs, command: run.current})
 
-    def keeps(share: float) -> bool:
+    @cache  # runs of all draws, mostly asked for twice at the share that is played
+    def predict(share: float) -> Prediction:
         excitation = design_excitation(controller, share=share, **given)
-        return not list_broken(controller, predict_played(controller, excitation, draws, options["sensors"]))
+        return predict_played(controller, excitation, draws, options["sensors"])
+
+    def keeps(share: float) -> bool:
+        return not list_broken(controller, predict(share))
 
     limit, command = controller.command_limit, controller.command.input
     excitation, run, effort = play(share)
@@ -279,7 +284,7 @@ def _excite(
         peaks = find_peaks(excitation, run)
     fields: dict[str, Any] = {"effort": effort, "friction": friction if dry else None}
     if predicts:
-        fields["prediction"] = predict_played(controller, excitation, draws, options["sensors"])
+        fields["prediction"] = predict(share)
         if enough is not None and list_broken(controller, fields["prediction"]):
             fields |= {"enough": enough, "lowered": share < chosen}
     return replace(excitation, peaks=peaks), fields
