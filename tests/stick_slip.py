@@ -84,33 +84,40 @@ def simulate(
     m, b, k, f_c, f_s, v_s, v_st, play = (np.array([getattr(each, name) for each in masses]) for name in names)
     f_s = np.maximum(f_s, f_c)
     h = period / substeps
+    reach = THETA * h
+    falls, loose, smooth = np.any(f_s > f_c), np.any(play > 0.0), v_s > 0.0  # what no run has is left out of the steps
+    friction, inertia = reach * f_c, m + reach * (b + reach * k)
     steps = [_DifferenceEquations(laws, path) for path in ("reference", "measurement")]
     delays = np.array([round(law["delay_samples"], 9) for law in laws]).astype(int, casting="unsafe")
     effort, force = np.zeros((len(masses), n)), np.zeros((len(masses), n))
     q, largest = np.zeros(len(masses)), np.zeros(len(masses))
     v = np.zeros(len(masses)) if velocity is None else np.array(velocity, dtype=float)
+    spring = np.zeros(len(masses))
     for sample in range(n):
-        force[:, sample] = k * (q - np.clip(q, -play, play))
+        force[:, sample] = spring
         effort[:, sample] = steps[0].step(reference[:, sample]) - steps[1].step(force[:, sample])
         before = sample - delays
         applied = np.where(before >= 0, effort[np.arange(len(masses)), np.maximum(before, 0)], 0.0)
         for _ in range(substeps):
-            level = f_c + (f_s - f_c) * np.exp(-((v / v_st) ** 2))
-            push = m * v + THETA * h * (applied - k * (q - np.clip(q, -play, play)))
-            inertia = m + THETA * h * (b + THETA * h * k * (np.abs(q) >= play))
-            mean = _solve_velocity(inertia, push, THETA * h * level, v_s)
+            if falls:
+                friction = reach * (f_c + (f_s - f_c) * np.exp(-((v / v_st) ** 2)))
+            if loose:
+                inertia = m + reach * (b + reach * k * (np.abs(q) >= play))
+            mean = _solve_velocity(inertia, m * v + reach * (applied - spring), friction, v_s, smooth)
             q = q + h * mean
             v = (mean - (1.0 - THETA) * v) / THETA
-            largest = np.maximum(largest, np.abs(k * (q - np.clip(q, -play, play))))
+            spring = k * (q - np.clip(q, -play, play) if loose else q)
+            largest = np.maximum(largest, np.abs(spring))
     return Runs(time=period * np.arange(n), force=force, effort=effort, largest=largest)
 
 
-def _solve_velocity(inertia: np.ndarray, push: np.ndarray, friction: np.ndarray, v_s: np.ndarray) -> np.ndarray:
-    """Return the velocity w of inertia w + friction Sgn(w) = push, or with tanh(w/v_s) for Sgn."""
+def _solve_velocity(
+    inertia: np.ndarray, push: np.ndarray, friction: np.ndarray, v_s: np.ndarray, smooth: np.ndarray
+) -> np.ndarray:
+    """Return the velocity w of inertia w + friction Sgn(w) = push, or where `smooth` with tanh(w/v_s) for Sgn."""
     size = np.abs(push)
     w = np.maximum(size - friction, 0.0) / inertia
-    smooth = v_s > 0.0
-    if np.any(smooth):
+    if smooth.any():
         scale = np.where(smooth, v_s, 1.0)
         at = np.maximum(w, size / (inertia + friction / scale))  # both are below the root of a concave function
         for _ in range(NEWTON_STEPS):

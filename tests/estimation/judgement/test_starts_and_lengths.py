@@ -7,6 +7,7 @@ and holds its duty for a millisecond.
 from __future__ import annotations
 
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -46,13 +47,19 @@ def turn_servo(goal, steps=10):
     return out
 
 
-def fit_servo(start, duration_s, *, parts=(), late_s=1.0 / RATE_HZ, free=(), diagnostics=True, **known):
+@cache
+def record_servo(duration_s, phase=0.0):
+    """Return a log of the servo under a chirp."""
     t = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
-    goal = 0.15 * np.sin(2 * np.pi * (0.3 * t + 0.5 * 9.7 / 8.0 * t**2))
-    log = so.Log.from_arrays(time=t, goal=goal, theta_m=turn_servo(goal))
+    goal = 0.15 * np.sin(2 * np.pi * (0.3 * t + 0.5 * 9.7 / 8.0 * t**2) + phase)
+    return so.Log.from_arrays(time=t, goal=goal, theta_m=turn_servo(goal))
+
+
+def fit_servo(start, duration_s, *, parts=(), late_s=1.0 / RATE_HZ, free=(), diagnostics=True, **known):
     plant = so.plants.let_stick(so.plants.rotary(parts=["duty_input", "position_servo", *parts]))
     params = plant.defaults.with_parameters(so.Parameter(name="k_p", value=GAIN, unit="-")).update(**KNOWN, **known)
     delay = so.Parameter(name="delay", value=late_s, unit="s", free=True, max=0.05)
+    log = record_servo(duration_s)
     bench = so.Experiment(plant=plant, log=log, outputs=("theta_m",), delay_s=delay, initial_state="rest")
     return so.fit([bench], params.update(**start).free(*SERVO, *free), diagnostics=diagnostics)
 
@@ -160,15 +167,12 @@ def test_a_delay_that_begins_samples_off_starts_where_the_log_has_it(late_s):
 
 def test_delays_of_several_logs_start_where_all_of_them_have_it():
     """One delay of three halves no cost of all."""
-    t = np.arange(round(4 * RATE_HZ)) / RATE_HZ
     plant = so.plants.let_stick(so.plants.rotary(parts=["duty_input", "position_servo", "servo_hold"]))
     gain = so.Parameter(name="k_p", value=GAIN, unit="-")
     params = plant.defaults.with_parameters(gain).update(**KNOWN, T_h=HOLD_S).update(**SERVO).free(*SERVO)
     benches = []
     for i in range(3):
-        goal = 0.15 * np.sin(2 * np.pi * (0.3 * t + 0.5 * 9.7 / 8.0 * t**2) + 0.5 * i)
-        log = so.Log.from_arrays(time=t, goal=goal, theta_m=turn_servo(goal))
-        delay = so.Parameter(name="delay", value=0.03, unit="s", free=True, max=0.05)
+        log, delay = record_servo(4.0, 0.5 * i), so.Parameter(name="delay", value=0.03, unit="s", free=True, max=0.05)
         bench = so.Experiment(
             name=f"bench_{i}", plant=plant, log=log, outputs=("theta_m",), delay_s=delay, initial_state="rest"
         )
