@@ -181,19 +181,21 @@ def tell(text: str, folder: Path) -> str:
     return re.sub(r"^(seaopt: )?(/?leg[.]toml: )*", "", line)
 
 
-def write_page() -> str:
-    """Return the page."""
+def try_row(part: str, folder: Path) -> list[str]:
+    """Return for each law why the part is refused beside it; empty where it works."""
+    return [try_combination(law, part, folder) for law in LAWS]
+
+
+def compose_page(rows: Mapping[str, list[str]]) -> str:
+    """Return the page of what was found for each part."""
     reasons: dict[str, int] = {}
     lines = [f"| | {' | '.join(LAWS)} |", f"|---|{':-:|' * len(LAWS)}"]
-    with TemporaryDirectory() as folder:
-        for part in PARTS:
-            cells: list[str] = []
-            for law in LAWS:
-                reason = try_combination(law, part, Path(folder))
-                cells.append("✓" if not reason else str(reasons.setdefault(reason, len(reasons) + 1)))
-            lines.append(f"| {part} | {' | '.join(cells)} |")
+    for part, found in rows.items():
+        cells = ["✓" if not reason else str(reasons.setdefault(reason, len(reasons) + 1)) for reason in found]
+        lines.append(f"| {part} | {' | '.join(cells)} |")
     return HEAD + "\n".join(lines) + "\n\n" + "\n".join(f"{n}. {text}" for text, n in reasons.items()) + "\n"
 
 
 if __name__ == "__main__":
-    PAGE.write_text(write_page(), encoding="utf-8")
+    with TemporaryDirectory() as scratch:
+        PAGE.write_text(compose_page({part: try_row(part, Path(scratch)) for part in PARTS}), encoding="utf-8")
