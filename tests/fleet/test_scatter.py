@@ -71,12 +71,12 @@ DOUBTED = ("slow walk", "season", "own seasons", "wear of all", "some scatter tw
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", BORNE_OUT)
 def test_alarms_of_healthy_actuators_are_those_that_are_stated(kind: str, seed: int) -> None:
     drift = judge(draw(kind, 400, seed), seed)
     assert drift.expected is not None, drift.doubt
-    low, high = poisson.ppf([0.001, 0.999], drift.expected)  # one in 500 fleets of 25 here
+    low, high = poisson.ppf([0.001, 0.999], drift.expected)  # one in 500 fleets of 15 here
     assert low <= count_alarms(drift) <= high
 
 
@@ -89,7 +89,7 @@ def test_alarms_of_heavy_tails_that_are_alike_are_those_that_are_stated() -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("kind", DOUBTED)
 def test_what_no_chart_is_made_for_has_no_expectation(kind: str, seed: int) -> None:
     drift = judge(draw(kind, 400, seed), seed)

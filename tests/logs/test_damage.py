@@ -238,7 +238,7 @@ def test_a_damaged_file_is_never_read_as_others(tmp_path, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_many_damaged_files_are_never_read_as_others(tmp_path, name):
-    count = 60 if name.startswith("mdf") else 400
+    count = 30 if name.startswith("mdf") else 200
     wrong, refused = try_damage(tmp_path, name, count)
     assert len(wrong) <= UNTOLD.get(name, 0.0) * 1500 and refused > count / 15, wrong
 

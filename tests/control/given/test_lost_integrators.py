@@ -143,11 +143,11 @@ def test_integrators_are_found_in_whatever_form():
 
 
 @pytest.mark.slow
-def test_a_thousand_laws_keep_their_integrators():
+def test_hundreds_of_laws_keep_their_integrators():
     rng = np.random.default_rng(1)
-    for case in draw_any(rng, 750):
+    for case in draw_any(rng, 300):
         check_law(*case)
-    for k in range(1000):
+    for k in range(400):
         check_law(*draw_turned(rng, k % 3))
 
 
@@ -187,9 +187,9 @@ def test_slow_poles_of_a_companion_form_make_no_integrator():
 
 
 @pytest.mark.slow
-def test_slow_poles_of_four_hundred_companion_forms_make_no_integrator():
+def test_slow_poles_of_many_companion_forms_make_no_integrator():
     rng = np.random.default_rng(4)
-    for k in range(400):
+    for k in range(180):
         check_none_is_made(draw_slow_companion(rng, k))
 
 

@@ -18,7 +18,7 @@ from seaopt.errors import InternalError, SeaoptError
 from tests.control.tuning.drawn_requests import draw_request
 
 QUICK = (9,)
-SLOW = 16  # benchmarks/bench_tune.py --requests 300 answers more
+SLOW = 10  # benchmarks/bench_tune.py --requests 300 answers more
 
 
 def answer(seed: int) -> None:
