@@ -50,10 +50,14 @@ nocompiler: $(READY)
 # themselves depend on is newer, so that they may use what is deprecated there. Argument types: see `slow`.
 FLOORS      := $(VENV)-floors
 FLOOR_TESTS := tests
-floors: $(READY)
+floors: $(FLOORS)/.ready
+	SEAOPT_TYPES=0 $(FLOORS)/bin/python -m pytest -n 2 --dist worksteal -q -m "not slow" -W default::DeprecationWarning $(FLOOR_TESTS)
+
+$(FLOORS)/.ready: pyproject.toml constraints.txt tools/floors.py tools/setup.sh | $(READY)
+	@mkdir -p $(CACHE)
 	$(BIN)/python tools/floors.py > $(CACHE)/floors.txt
 	@sh tools/setup.sh $(FLOORS) $(CACHE)/floors.txt formats,test
-	SEAOPT_TYPES=0 $(FLOORS)/bin/python -m pytest -n 2 --dist worksteal -q -m "not slow" -W default::DeprecationWarning $(FLOOR_TESTS)
+	@touch $@
 
 # Figures that a refactoring must keep, against tests/golden; SUBJECTS="draws schedule" for some of them.
 golden: $(READY)
