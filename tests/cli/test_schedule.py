@@ -34,25 +34,18 @@ def knee(folder, text):
 
 
 @pytest.mark.slow
-def test_tune_writes_a_schedule_that_export_takes(knee, seaopt):
+def test_tune_writes_a_schedule_that_export_takes_with_the_gate_of_its_file_at_every_point(knee, seaopt, text):
+    gated = text.replace("[controller.schedule]", "[controller.gate]\nrange_N = [-200, 200]\n\n[controller.schedule]")
+    (knee / "knee.toml").write_text(gated, encoding="utf-8")
     out = seaopt("tune", "knee.toml")
     assert out.returncode == 0, out.stderr
     content = json.loads((knee / "out" / "controller.json").read_text(encoding="utf-8"))
     assert content["schema"] == "seaopt/controller/3" and content["schedule"]["points"] == [0.0, 0.35]
+    assert content["guards"]["gate"]["range_N"] == [-200.0, 200.0]
     assert not list(validator("controller").iter_errors(content))
     written = seaopt("export", "out", "--c", "c", "--name", "knee")
     assert written.returncode == 1 and {path.name for path in (knee / "c").iterdir()} == {"knee.h", "knee.c"}
     assert "not certified" in written.stdout
-
-
-@pytest.mark.slow
-def test_a_schedule_has_the_gate_of_its_file_at_every_point_and_in_c(knee, seaopt, text):
-    gated = text.replace("[controller.schedule]", "[controller.gate]\nrange_N = [-200, 200]\n\n[controller.schedule]")
-    (knee / "knee.toml").write_text(gated, encoding="utf-8")
-    assert seaopt("tune", "knee.toml").returncode == 0
-    content = json.loads((knee / "out" / "controller.json").read_text(encoding="utf-8"))
-    assert content["guards"]["gate"]["range_N"] == [-200.0, 200.0]
-    assert seaopt("export", "out", "--c", "c", "--name", "knee").returncode == 1
     assert "A reading is believed" in (knee / "c" / "knee.h").read_text(encoding="utf-8")
     assert seaopt("export", "out", "--c", "d", "--name", "knee", "--no-gate").returncode == 1
     assert "A reading is believed" not in (knee / "d" / "knee.h").read_text(encoding="utf-8")
@@ -66,8 +59,9 @@ def test_a_whole_run_is_met_and_its_report_has_the_schedule(knee, seaopt):
     page = (knee / "out" / "report.html").read_text(encoding="utf-8")
     assert "Gains at the points" in page and "proved" in page
     assert seaopt("report", "knee.toml").returncode == 0
-    content = json.loads((knee / "out" / "robustness.json").read_text(encoding="utf-8"))
-    assert not list(validator("robustness").iter_errors(content))
+    for document, name in (("controller", "controller.json"), ("robustness", "robustness.json")):
+        content = json.loads((knee / "out" / name).read_text(encoding="utf-8"))
+        assert not list(validator(document).iter_errors(content))
     written = seaopt("export", "out", "--c", "c")
     assert written.returncode == 0 and "not certified" not in written.stdout
 
