@@ -21,23 +21,6 @@ TRUTH = {"J_m": 2.4e-5, "b_r": 1e-4, "f_c": 0.005, "k_s": 300.0, "J_l": 0.25, "d
 
 
 @pytest.mark.slow
-def test_short_logs_of_the_knee_are_fitted_and_tuned(tmp_path):
-    """The file as it is, with logs of a few seconds: the truth within its interval, and every limit met."""
-    text = KNEE.read_text(encoding="utf-8").replace("duration_s = 30", "duration_s = 3")
-    path = tmp_path / "knee.toml"
-    path.write_text(text.replace("duration_s = 20", "duration_s = 3"), encoding="utf-8")
-    problem = so.read_problem(path)
-    fit = so.fit(problem.experiments(), problem.parameters, **problem.fit_options)
-    assert fit.met, fit.verdict
-    so.testing.assert_recovered(fit, problem.parameters.update(**TRUTH), sigmas=4)
-    controller = so.tune(
-        problem.design_plant, fit.parameters, problem.spec, robust_to=problem.robust_to(fit.parameters)
-    )
-    assert controller.feasible, controller.explanation
-    assert controller.command.effort_unit == "N m"
-
-
-@pytest.mark.slow
 def test_the_knee_runs_with_everything_met(tmp_path):
     command = [sys.executable, "-m", "seaopt", "run", str(KNEE), "-o", str(tmp_path)]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
