@@ -55,15 +55,13 @@ def test_rows_are_what_a_recomputation_gives(stand, swing, thor):
 def test_a_row_says_what_friction_costs(stand, thor):
     """Without sticking is what a plant whose friction is nothing can have: Coulomb friction does not damp in motion."""
     spec = so.ControllerSpec(structure="pd", max_sensitivity=1.6, max_noise_gain=25)
-    (row,), (free,) = (
-        sweep(stand, thor.update(f_c=f_c), spec, [40], {"twin": stand}).rows for f_c in (50.0, 0.0)
-    )  # fmt: skip
+    rubbing, smooth = (sweep(stand, thor.update(f_c=f_c), spec, [40], {"twin": stand}) for f_c in (50.0, 0.0))
+    (row,), (free,) = rubbing.rows, smooth.rows
     assert free.without_sticking is None
     assert row.without_sticking.feasible == free.feasible
     assert row.without_sticking.disturbance == pytest.approx(free.disturbance, rel=1e-2)
     assert row.without_sticking.disturbance <= row.disturbance * 1.001
-    table = repr(sweep(stand, thor.update(f_c=50.0), spec, [40]))
-    assert "friction: by how much it raises the integral" in table and "%" in table
+    assert "friction: by how much it raises the integral" in repr(rubbing) and "%" in repr(rubbing)
 
 
 POINTS = [5e5, 6e5]

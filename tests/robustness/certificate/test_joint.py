@@ -41,7 +41,6 @@ def done(stand, swing, thor, seen):
     )
 
 
-@pytest.mark.slow
 def test_few_rounds_are_enough(done, seen):
     assert done.status == "certified"
     assert 2 <= len(done.rounds) <= 4
