@@ -43,7 +43,14 @@ class UnitError(SeaoptError):
 
 
 class PlantError(SeaoptError):
-    """A plant is not well defined, or is asked for something that it does not have."""
+    """A plant is not well defined, or is asked for something that it does not have.
+
+    `plant` is the name that the text begins with, empty where it names none, and `reason` what follows.
+    """
+
+    def __init__(self, reason: str, *, plant: str = "") -> None:
+        super().__init__(f"plant {plant}: {reason}" if plant else reason)
+        self.plant, self.reason = plant, reason
 
 
 class LogError(SeaoptError):

@@ -192,6 +192,19 @@ def parse_file(
         raise error(f"{source}: cannot be read ({describe_os_error(problem)}); {remedy}") from problem
     except ValueError as problem:  # bytes that are no text, or a path that no system has
         raise error(f"{source}: cannot be read as UTF-8 text ({problem}); {remedy}") from problem
+    return parse_text(text, source, parse, form, remedy=remedy, error=error)
+
+
+def parse_text(
+    text: str,
+    source: Path | str,
+    parse: Callable[[str], Any],
+    form: str,
+    *,
+    remedy: str,
+    error: type[SeaoptError] = FileError,
+) -> Any:
+    """Parse the text of a file, as `parse_file` does."""
     try:
         content = parse(text)
         check_content(content)

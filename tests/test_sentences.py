@@ -8,11 +8,11 @@ from pathlib import Path
 SEAOPT = Path(__file__).resolve().parents[1] / "seaopt"
 # Names of what is said. A search of them, or a cut, is a sentence that is parsed.
 SAID = {"text", "where", "reason", "message", "sentence", "explanation", "verdict", "said", "remedy", "summary",
-        "label", "draws", "proof", "assumption", "statement", "what", "str"}  # fmt: skip
+        "label", "draws", "proof", "assumption", "statement", "what", "str", "error"}  # fmt: skip
 LISTS = {"active_constraints", "blocked_by", "broken", "explanations", "labels", "notes", "reasons", "remarks",
          "sentences", "texts"}  # of what is said: their entries are, under any name  # fmt: skip
 CUTS = {"split", "rsplit", "partition", "rpartition", "startswith", "endswith", "find", "index", "removeprefix",
-        "removesuffix"}  # fmt: skip
+        "removesuffix", "replace"}  # fmt: skip
 PATTERNS = {"search", "match", "fullmatch", "findall", "finditer", "split"}  # verbs of a regular expression that read
 # What is read there, and why it is no sentence of a result, or what it waits for.
 READERS = {
@@ -23,11 +23,10 @@ READERS = {
     "files.py": "Python's own text of an error, without its advice to programmers",
     "estimation/result/identifiability.py": "EXPERIMENT.NAME of an unknown",
     "fleet/history.py": "names of logs, in which numbers are sorted",
+    "fleet/result.py": "a log's own name in its reason, so that reasons of several logs are counted as one",
     "logs": "columns and files",
     "plants": "equations and files",
     "problem/proposal/questions.py": "answers",
-    "problem/problem.py": "a remark of an experiment, found by its name",
-    "problem/reading.py": "an error's text under another place",
     "reporting/page/chart.py": "matplotlib's mark of a line without a label",
     "reporting/sections/kinds/fit.py": "a message that an error repeats is not said twice",
     "robustness": "names of draws and conditions, and blanks of a wrong value",
@@ -45,7 +44,11 @@ def name_of(node):
             return name_of(function)
         case ast.Attribute(attr=name) | ast.Name(id=name):
             return name
+        case ast.Subscript(slice=ast.Constant(value=str(key))) if key in SAID:
+            return key
         case ast.Subscript(value=value):
+            return name_of(value)
+        case ast.BoolOp(values=[value, *_]):
             return name_of(value)
     return ""
 
@@ -71,7 +74,9 @@ def test_the_search_finds_what_was_parsed_before():
     source = "plant = row.where.split(':')[0]\nhead = str(draws).partition(':')\nunstable = 'UNSTABLE' in row.text\n"
     source += "first = re.split(', ', question.text)[0]\nsize = _NUMBER.search(finding.text)\n"
     source += "easing = [name.partition(' (')[0] for name in controller.active_constraints]\n"
-    assert len(list(list_parsed(source))) == 6
+    source += "text = str(error).replace(draft, target)\nkind = errors[0]['where'].removeprefix(name)\n"
+    source += "reason = (reason or '').replace(log, 'LOG')\nnamed = name in error\n"
+    assert len(list(list_parsed(source))) == 10
 
 
 def test_no_sentence_of_a_result_is_parsed():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -14,10 +13,10 @@ from seaopt.cli.inspect import parse_pairs
 from seaopt.cli.progress import show_progress
 from seaopt.cli.terminal import Terminal
 from seaopt.errors import ProblemError, SeaoptError
-from seaopt.files import check_regular, describe_os_error, exists, to_json, write_text
+from seaopt.files import check_regular, exists, to_json, write_text
 from seaopt.formatting import join_words
-from seaopt.problem import read_problem
 from seaopt.problem.proposal import Proposal, Question, propose
+from seaopt.problem.reading import check_problem
 
 COLUMN_HEAD = ("column", "role", "unit", "meaning")
 GUESS_HEAD = ("guess", "value", "why")
@@ -45,7 +44,8 @@ def write_problem(
     with show_progress(errors, "looking at the logs", errors.say, brief=True) as tell:
         proposal = look(logs, {}, folder, target.stem, tell)
     if yes or json:
-        _write_checked(target, proposal.text)
+        check_problem(proposal.text, target)
+        write_text(target, proposal.text)
     else:
         proposal = _interview(console, target, proposal, lambda given: look(logs, given, folder, target.stem))
     if json:
@@ -84,26 +84,6 @@ def _choose_target(logs: Sequence[Path], output: Path | None, *, force: bool) ->
     return target
 
 
-def _write_checked(target: Path, text: str, *, keep: bool = True) -> None:
-    """Write a problem file that the other commands take, unless it is only checked; where they would not, what was
-    there stays.
-    """
-    draft = target.with_name(f".seaopt-{secrets.token_hex(8)}.toml")
-    try:
-        write_text(draft, text)
-        read_problem(draft)
-        if keep:
-            draft.replace(target)
-    except SeaoptError as error:
-        raise ProblemError(str(error).replace(str(draft), str(target))) from error
-    except OSError as error:
-        raise ProblemError(
-            f"{target}: cannot be written ({describe_os_error(error)}); give another file: -o"
-        ) from error
-    finally:
-        draft.unlink(missing_ok=True)
-
-
 def _interview(
     console: Terminal, target: Path, proposal: Proposal, look: Callable[[Mapping[str, str]], Proposal]
 ) -> Proposal:
@@ -121,9 +101,8 @@ def _interview(
                 answers[question.key] = answer or question.guess
                 proposal = look(answers)
         try:
-            _write_checked(target, proposal.text)
-            return proposal
-        except ProblemError as error:
+            check_problem(proposal.text, target)
+        except SeaoptError as error:
             wrong = next((key for key in reversed(answers) if _is_taken(target, look, answers, key)), None)
             if wrong is None:
                 raise
@@ -131,6 +110,9 @@ def _interview(
             done.remove(wrong)
             answers.pop(wrong)
             proposal = look(answers)
+        else:
+            write_text(target, proposal.text)
+            return proposal
 
 
 def _is_taken(
@@ -139,7 +121,7 @@ def _is_taken(
     """Tell whether the other commands take the file with a guess in place of one of the answers."""
     try:
         text = look({key: answer for key, answer in answers.items() if key != without}).text
-        _write_checked(target, text, keep=False)
+        check_problem(text, target)
     except SeaoptError:
         return False
     return True

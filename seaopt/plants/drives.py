@@ -99,8 +99,9 @@ def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
     actuation, inductive = plant.actuation, "inductance" in parts
     if actuation is None or actuation.speed is None:
         raise PlantError(
-            f'plant {plant.name}: part "{part}" needs the speed on which the motor works; give the role '
-            "actuation = Actuation(input, effort, speed=lambda x, p: ...)"
+            f'part "{part}" needs the speed on which the motor works; give the role '
+            "actuation = Actuation(input, effort, speed=lambda x, p: ...)",
+            plant=plant.name,
         )
     speed, current, (name, unit) = actuation.speed, actuation.input, INPUTS[part]
     winding = plant.winding  # one that warms up brings its resistance
@@ -151,14 +152,16 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
     position = sensing and (sensing.motor_position or sensing.link_position)
     if not sensing or not position:
         raise PlantError(
-            f'plant {plant.name}: part "position_servo" needs the position that it holds; give the role '
-            "sensing = Sensing(regulated, motor_position=...)"
+            'part "position_servo" needs the position that it holds; give the role '
+            "sensing = Sensing(regulated, motor_position=...)",
+            plant=plant.name,
         )
     rate = sensing.motor_speed if sensing.motor_position else (plant.port.rate if plant.port else None)
     if "servo_hold" in parts and not rate:
         raise PlantError(
-            f'plant {plant.name}: part "servo_hold" needs the speed of the position that is held; give the role '
-            "sensing = Sensing(regulated, motor_position=..., motor_speed=...)"
+            'part "servo_hold" needs the speed of the position that is held; give the role '
+            "sensing = Sensing(regulated, motor_position=..., motor_speed=...)",
+            plant=plant.name,
         )
     source = next(iter(plant.inputs))
     integral, limited = "servo_integral" in parts, "servo_limit" in parts

@@ -99,7 +99,7 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
             raise PlantError(
-                f"plant {plant.name}: the FMU cannot be made ({reason}); check compiler and include"
+                f"the FMU cannot be made ({reason}); check compiler and include", plant=plant.name
             ) from error
         described = next(Path(source) for source in content if Path(source).name == DESCRIPTION)
         text = described.read_text(encoding="utf-8")

@@ -387,8 +387,9 @@ def find_range(plant: Plant, params: ParameterSet) -> float | None:
     largest = evaluate(expression, values)
     if not 0.0 < largest < math.inf:
         raise PlantError(
-            f"plant {plant.name}: actuation.largest is {largest:g}, which must be positive and finite; check "
-            f"{describe_parameters(expression, values) or 'its actuation'}"
+            f"actuation.largest is {largest:g}, which must be positive and finite; check "
+            f"{describe_parameters(expression, values) or 'its actuation'}",
+            plant=plant.name,
         )
     return largest
 
@@ -495,7 +496,7 @@ def refuse_clash(plant: Plant, part: str, names: Iterable[str], replaced: str = 
     taken = {*plant.states, *plant.outputs, *plant.parameters, *plant.inputs} - {replaced}
     for name in names:
         if name in taken:
-            raise PlantError(f'plant {plant.name}: part "{part}" has "{name}", which the plant has, too')
+            raise PlantError(f'part "{part}" has "{name}", which the plant has, too', plant=plant.name)
 
 
 def refuse_samples(plant: Plant) -> None:

@@ -15,7 +15,7 @@ from seaopt.control import ControllerSpec, MPCSpec
 from seaopt.control import draw as draw_values
 from seaopt.control.laws.delay import LoopSpec, find_drive, find_drive_delay, take_own_delays
 from seaopt.control.loops.sampled_plant import add_drive_delay, find_signals
-from seaopt.errors import LogError, ProblemError, SeaoptError, suggestion
+from seaopt.errors import EstimationError, LogError, ProblemError, SeaoptError, suggestion
 from seaopt.estimation import (
     Experiment,
     Fit,
@@ -269,9 +269,8 @@ class Problem:
             try:
                 experiments.append(self._make_experiment(table))
             except SeaoptError as error:
-                text = str(error)
-                named = text if f"experiment {table.name}" in text else f"experiment {table.name}: {text}"
-                raise type(error)(f"{self.source}: {named}") from error
+                where = "" if isinstance(error, EstimationError) else f"experiment {table.name}: "  # it names itself
+                raise type(error)(f"{self.source}: {where}{error}") from error
         return tuple(experiments)
 
     def choose_fitted(self, experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
@@ -346,13 +345,13 @@ class Problem:
             return stated
         signal, where = log.signal(OWN + name), f"experiment {table.name}: parameters: {name}"
         if signal.unit and signal.unit != unit and not same_dimension(signal.unit, unit):
-            raise ProblemError(
+            raise EstimationError(
                 f'{where} is in {unit or "no unit"}, and column "{stated.column}" in {signal.unit}; correct the '
                 "column's unit"
             )
         value = float(np.median(signal.values))
         if not np.all(np.abs(signal.values - value) <= ROUNDED * abs(value)):
-            raise ProblemError(f'{where} is not one value throughout column "{stated.column}"; make it an input')
+            raise EstimationError(f'{where} is not one value throughout column "{stated.column}"; make it an input')
         return value
 
     def _read_log(self, table: ExperimentTable, *, anywhere: bool) -> Log:
@@ -416,7 +415,7 @@ def _compute_speeds(log: Log, table: ExperimentTable) -> Log:
     for name, difference in table.differences.items():
         if difference.of not in log.signals:
             near = suggestion(difference.of, log.signals)
-            raise ProblemError(f'experiment {table.name}: differences: {name} is of "{difference.of}"; {near}')
+            raise EstimationError(f'experiment {table.name}: differences: {name} is of "{difference.of}"; {near}')
         values = make_record(DifferencedSpeed, difference).read(log[difference.of], log.period)
         speeds[name] = Signal(name=name, values=values, unit=f"{log.signals[difference.of].unit}/s")
     return replace(log, signals={**log.signals, **speeds}) if speeds else log
@@ -427,7 +426,7 @@ def _resample(log: Log, table: ExperimentTable) -> Log:
     resample = table.resample
     anew = table.decimate > 1 or (resample is not None and resample != "restamp" and resample.rule != "restamp")
     if table.differences and anew:
-        raise ProblemError(
+        raise EstimationError(
             f"experiment {table.name}: {next(iter(table.differences))} is a difference over samples as they were "
             "taken, which decimate and resample do not keep; leave them out, or fit the position"
         )

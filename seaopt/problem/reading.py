@@ -12,8 +12,8 @@ from typing import Any
 
 from seaopt.control import ControllerSpec
 from seaopt.documents import check_table, has_unknown_key
-from seaopt.errors import FileError, ProblemError, SeaoptError, require_type
-from seaopt.files import check_regular, exists, parse_file
+from seaopt.errors import FileError, PlantError, ProblemError, SeaoptError, require_type
+from seaopt.files import check_regular, exists, parse_file, parse_text
 from seaopt.plants import Plant, plant_of_kind
 from seaopt.problem.bench_tables import AnyPlant, EquationsTable, PlantTable
 from seaopt.problem.equations import make_plant, order_plants
@@ -73,6 +73,12 @@ def read_problem(path: Path | str, *, design: bool = True) -> Problem:
     return replace(_make(fitted, str(path)), refused=refused)
 
 
+def check_problem(text: str, target: Path) -> None:
+    """Refuse the text of a problem file that is to be written, where the other commands would not take it."""
+    content = parse_text(text, target, tomllib.loads, "TOML", remedy="rename the log", error=ProblemError)
+    _make(content, str(target))
+
+
 def _make(content: Mapping[str, Any], source: str) -> Problem:
     table = check_table(ProblemTable, content, source, error=ProblemError)
     return make_problem(table, source, Path(source).parent)
@@ -110,8 +116,8 @@ def _make_plants(tables: Mapping[str, AnyPlant]) -> dict[str, Plant]:
             stated = isinstance(table, EquationsTable)
             plants[name] = make_plant(name, table, plants) if stated else _make_plant_of_kind(table)
         except SeaoptError as error:
-            text = str(error).removeprefix(f"plant {name}: ")
-            raise type(error)(f"plant.{name}: {text}") from error
+            named = isinstance(error, PlantError) and error.plant == name
+            raise type(error)(f"plant.{name}: {error.reason if named else error}") from error
     return {name: plants[name] for name in tables}
 
 

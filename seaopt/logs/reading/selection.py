@@ -248,11 +248,10 @@ def _explain_missing(places: Sequence[Source], name: str, wanted: Column) -> str
 
 def suggest_names(name: str, names: Sequence[str]) -> str:
     """Return what to say after an unknown name, however many names there are."""
-    text = suggestion(name, names)
-    if text.startswith("known") and len(names) > MAX_NAMES:
-        shown = ", ".join(names[:MAX_NAMES])
-        return f"known: {shown}, ... ({len(names)} in all; contents(path), or seaopt inspect --list, lists them)"
-    return text
+    if len(names) <= MAX_NAMES or get_close_matches(name, names, n=1, cutoff=0.6):
+        return suggestion(name, names)
+    shown = ", ".join(names[:MAX_NAMES])
+    return f"known: {shown}, ... ({len(names)} in all; contents(path), or seaopt inspect --list, lists them)"
 
 
 def _list_paths(sources: Sequence[Source]) -> str:

@@ -35,13 +35,13 @@ def evaluate_equations(
         if not isinstance(error.obj, SimpleNamespace):
             raise
         raise PlantError(
-            f'plant {plant.name}: {what} uses "{error.name}"; {suggestion(str(error.name), vars(error.obj))}'
+            f'{what} uses "{error.name}"; {suggestion(str(error.name), vars(error.obj))}', plant=plant.name
         ) from error
     except (TypeError, RuntimeError, NotImplementedError) as error:
         reason = str(error).strip().splitlines()[-1][:160]
         raise PlantError(
-            f"plant {plant.name}: {what} cannot be made symbolic ({reason}); "
-            "use CasADi's functions, and ca.if_else for a branch"
+            f"{what} cannot be made symbolic ({reason}); use CasADi's functions, and ca.if_else for a branch",
+            plant=plant.name,
         ) from error
 
 
@@ -49,31 +49,30 @@ def check_names(plant: Plant) -> None:
     """Refuse names that are no identifiers or are used twice, and units that are missing or unknown."""
     for group in ("states", "inputs", "outputs", "parameters"):
         if not isinstance(getattr(plant, group), Mapping):
-            raise PlantError(f"plant {plant.name}: {group} is no mapping; give {{name: unit}}")
+            raise PlantError(f"{group} is no mapping; give {{name: unit}}", plant=plant.name)
         for name, declared in getattr(plant, group).items():
             unit = declared.unit if isinstance(declared, Parameter) else declared
             if not isinstance(unit, str) or (group == "parameters" and not unit.strip()):
-                raise PlantError(
-                    f'plant {plant.name}: "{name}" in {group} has no unit; give one, "-" for a pure number'
-                )
+                raise PlantError(f'"{name}" in {group} has no unit; give one, "-" for a pure number', plant=plant.name)
             if unit.strip() not in DIMENSIONLESS and not PLAIN_UNIT.fullmatch(unit):
                 si_unit(unit)
     seen: dict[str, str] = {}
     for group in ("states", "inputs", "parameters", "friction"):
         for name in getattr(plant, group):
             if not name.isidentifier():
-                raise PlantError(f'plant {plant.name}: "{name}" in {group} is not a name; use letters, digits and _')
+                raise PlantError(f'"{name}" in {group} is not a name; use letters, digits and _', plant=plant.name)
             if name in seen:
-                raise PlantError(f'plant {plant.name}: "{name}" is in {seen[name]} and in {group}; rename one')
+                raise PlantError(f'"{name}" is in {seen[name]} and in {group}; rename one', plant=plant.name)
             seen[name] = group
     if ENERGY in plant.outputs:
         raise PlantError(
-            f'plant {plant.name}: the output "{ENERGY}" has the name of the simulated energy (J); rename the output, '
-            "and give energy=lambda x, p: ... where it is what the plant stores"
+            f'the output "{ENERGY}" has the name of the simulated energy (J); rename the output, '
+            "and give energy=lambda x, p: ... where it is what the plant stores",
+            plant=plant.name,
         )
     unknown = sorted(plant.optional_inputs - set(plant.inputs))
     if unknown:
-        raise PlantError(f"plant {plant.name}: optional input {unknown[0]} is not an input; add it to inputs")
+        raise PlantError(f"optional input {unknown[0]} is not an input; add it to inputs", plant=plant.name)
 
 
 def check_loads(plant: Plant, name: str, friction: Friction, spaces: list[SimpleNamespace]) -> None:
@@ -82,12 +81,13 @@ def check_loads(plant: Plant, name: str, friction: Friction, spaces: list[Simple
     if sorted(loads) != sorted(friction.rated):
         rated = ", ".join(friction.rated) or "none"
         raise PlantError(
-            f"plant {plant.name}: friction {name} has the loads {', '.join(loads) or 'none'}, and rated has {rated}; "
-            "give the largest size of each load in rated"
+            f"friction {name} has the loads {', '.join(loads) or 'none'}, and rated has {rated}; "
+            "give the largest size of each load in rated",
+            plant=plant.name,
         )
     taken = [load for load in loads if load in plant.parameters]
     if taken:
-        raise PlantError(f'plant {plant.name}: load "{taken[0]}" of friction {name} is a parameter; name it otherwise')
+        raise PlantError(f'load "{taken[0]}" of friction {name} is a parameter; name it otherwise', plant=plant.name)
 
 
 # What the fields of a role name.
@@ -124,12 +124,12 @@ def check_roles(plant: Plant) -> None:
             for name in (stated,) if isinstance(stated, str) else stated:
                 if name not in groups[group]:
                     raise PlantError(
-                        f'plant {plant.name}: {key}.{field} = "{name}" is not one of its own; '
-                        f"{suggestion(name, groups[group])}"
+                        f'{key}.{field} = "{name}" is not one of its own; {suggestion(name, groups[group])}',
+                        plant=plant.name,
                     )
     if plant.actuation is not None and plant.actuation.input != next(iter(plant.inputs)):
         raise PlantError(
-            f'plant {plant.name}: actuation.input = "{plant.actuation.input}" is not the first input; put it first'
+            f'actuation.input = "{plant.actuation.input}" is not the first input; put it first', plant=plant.name
         )
 
 
@@ -152,27 +152,27 @@ def check_bristles(plant: Plant, spaces: list[SimpleNamespace]) -> None:
         ):
             rate, expected = next(rates), next(rates)
             if abs(rate - expected) > 1e-6 * max(abs(rate), abs(expected)):  # what is not finite there is not judged
-                raise PlantError(f"plant {plant.name}: friction {name}: {message} ({rate:.6g} against {expected:.6g})")
+                raise PlantError(f"friction {name}: {message} ({rate:.6g} against {expected:.6g})", plant=plant.name)
 
 
 def stack_rows(plant: Plant, what: str, equations: Mapping[str, Any], names: Mapping[str, str]) -> Any:
     """Return the expressions in the order of `names`, refusing missing and unknown ones."""
     if not isinstance(equations, Mapping):
-        raise PlantError(f"plant {plant.name}: {what} returns a {type(equations).__name__}; give {{name: expression}}")
+        raise PlantError(f"{what} returns a {type(equations).__name__}; give {{name: expression}}", plant=plant.name)
     for name in equations:
         if name not in names:
-            raise PlantError(f'plant {plant.name}: {what} returns "{name}"; {suggestion(name, names)}')
+            raise PlantError(f'{what} returns "{name}"; {suggestion(name, names)}', plant=plant.name)
     for name in names:
         if name not in equations:
-            raise PlantError(f'plant {plant.name}: {what} returns nothing for "{name}"; add its equation')
+            raise PlantError(f'{what} returns nothing for "{name}"; add its equation', plant=plant.name)
     rows: list[Any] = []
     for name in names:
         try:
             row = ca.SX(equations[name])
         except (TypeError, NotImplementedError) as error:
-            raise PlantError(f'plant {plant.name}: {what} gives no expression for "{name}"') from error
+            raise PlantError(f'{what} gives no expression for "{name}"', plant=plant.name) from error
         if not row.is_scalar():
-            raise PlantError(f'plant {plant.name}: {what} gives "{name}" the shape {row.shape}; give one expression')
+            raise PlantError(f'{what} gives "{name}" the shape {row.shape}; give one expression', plant=plant.name)
         rows.append(row)
     return ca.vertcat(*rows) if rows else ca.SX(0, 1)
 
@@ -183,7 +183,7 @@ def check_structure(plant: Plant) -> None:
     still = () if plant.sensing is None else plant.sensing.still
     for index, name in enumerate(plant.outputs):
         if name not in still and not ca.depends_on(plant.output[index], moved_by):
-            raise PlantError(f'plant {plant.name}: output "{name}" depends on no state and no input; check h')
+            raise PlantError(f'output "{name}" depends on no state and no input; check h', plant=plant.name)
     sampled = plant.sampling.sets if plant.sampling is not None else {}
     for index, name in enumerate(plant.states):
         if name in sampled:
@@ -192,6 +192,6 @@ def check_structure(plant: Plant) -> None:
         free = not plant.inputs  # a plant without inputs may decay by itself
         if not ca.depends_on(plant.dynamics[index], moved_by if free else movers):
             raise PlantError(
-                f'plant {plant.name}: state "{name}" is driven by nothing, no input, no other state; '
-                "check f, or make it a parameter"
+                f'state "{name}" is driven by nothing, no input, no other state; check f, or make it a parameter',
+                plant=plant.name,
             )

@@ -108,8 +108,9 @@ def let_droop(plant: Plant) -> Plant:
     actuation = plant.actuation
     if actuation is None or plant.inputs[actuation.input] != AMPERE:
         raise PlantError(
-            f'plant {plant.name}: part "droop" takes the motor\'s current; give the role actuation = '
-            "Actuation(input, effort) with an input in A"
+            'part "droop" takes the motor\'s current; give the role actuation = '
+            "Actuation(input, effort) with an input in A",
+            plant=plant.name,
         )
     current = actuation.input
 
@@ -127,8 +128,9 @@ def let_torque_fall(plant: Plant) -> Plant:
     actuation = plant.actuation
     if actuation is None or actuation.speed is None:
         raise PlantError(
-            f'plant {plant.name}: part "falling_torque" needs the speed on which the motor works; give the role '
-            "actuation = Actuation(input, effort, speed=lambda x, p: ...)"
+            'part "falling_torque" needs the speed on which the motor works; give the role '
+            "actuation = Actuation(input, effort, speed=lambda x, p: ...)",
+            plant=plant.name,
         )
     name, speed = actuation.input, actuation.speed
 
@@ -214,8 +216,9 @@ def let_cog(plant: Plant) -> Plant:
     position = plant.sensing.motor_position if plant.sensing is not None else None
     if position is None or position not in plant.states:
         raise PlantError(
-            f'plant {plant.name}: part "cogging" needs a state that is the motor\'s position; give the role '
-            "sensing = Sensing(regulated, motor_position=...)"
+            'part "cogging" needs a state that is the motor\'s position; give the role '
+            "sensing = Sensing(regulated, motor_position=...)",
+            plant=plant.name,
         )
 
     read = f"{position}_read"
@@ -233,7 +236,7 @@ def let_cog(plant: Plant) -> Plant:
 def let_stand_give(plant: Plant) -> Plant:
     """Return a plant on a stand that gives. Raises PlantError: its link moves, or it has no stiffness."""
     if plant.moves:
-        raise PlantError(f'plant {plant.name}: part "stand" holds a link, and this one moves; leave it out')
+        raise PlantError('part "stand" holds a link, and this one moves; leave it out', plant=plant.name)
     spring, stiffness = _find_spring(plant, "stand")
     derived, energy = plant.derived, plant.energy
 
@@ -263,8 +266,9 @@ def _find_spring(plant: Plant, part: str) -> tuple[SeriesSpring, str]:
     spring = plant.spring
     if spring is None or spring.stiffness is None:
         raise PlantError(
-            f'plant {plant.name}: part "{part}" needs the stiffness of its spring; give the role '
-            "spring = SeriesSpring(deflection, unit, stiffness=...)"
+            f'part "{part}" needs the stiffness of its spring; give the role '
+            "spring = SeriesSpring(deflection, unit, stiffness=...)",
+            plant=plant.name,
         )
     return spring, spring.stiffness
 
@@ -275,8 +279,9 @@ def _find_friction(plant: Plant, part: str) -> tuple[str, Friction]:
         if friction.bristles is None:
             return name, friction
     raise PlantError(
-        f'plant {plant.name}: part "{part}" changes a friction without bristles, and there is none; declare it where '
-        "the plant is made: friction={NAME: Friction(...)}"
+        f'part "{part}" changes a friction without bristles, and there is none; declare it where '
+        "the plant is made: friction={NAME: Friction(...)}",
+        plant=plant.name,
     )
 
 

@@ -121,8 +121,9 @@ def add_heat(plant: Plant) -> Plant:
     actuation = plant.actuation
     if actuation is None or plant.inputs[actuation.input] != "A":
         raise PlantError(
-            f'plant {plant.name}: part "thermal" needs the current that heats the winding; give the role '
-            "actuation = Actuation(input, effort) with an input in A"
+            'part "thermal" needs the current that heats the winding; give the role '
+            "actuation = Actuation(input, effort) with an input in A",
+            plant=plant.name,
         )
     refuse_clash(plant, "thermal", (*RISES, *TEMPERATURES, *(parameter.name for parameter in PARAMETERS)))
     return extend(

@@ -42,11 +42,11 @@ def read_deflection(plant: Plant) -> Plant:
     spring, sensing = plant.spring, plant.sensing
     if spring is None or sensing is None or not sensing.regulated:
         missing = "spring = SeriesSpring(deflection, unit)" if spring is None else "sensing = Sensing(regulated=...)"
-        raise PlantError(f'plant {plant.name}: part "deflection_sensor" needs the role {missing}; give it')
+        raise PlantError(f'part "deflection_sensor" needs the role {missing}; give it', plant=plant.name)
     unit = plant.outputs[sensing.regulated[0]]
     name = "tau_d" if unit == ROTARY.unit else "F_d"
     if name in plant.outputs or NOMINAL in plant.parameters:
-        raise PlantError(f'plant {plant.name}: part "deflection_sensor" has {name} and {NOMINAL}, which it has, too')
+        raise PlantError(f'part "deflection_sensor" has {name} and {NOMINAL}, which it has, too', plant=plant.name)
     deflection = spring.deflection
     return extend(
         plant,

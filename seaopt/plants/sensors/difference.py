@@ -121,8 +121,9 @@ def find_state(plant: Plant, position: str) -> str:
             if ca.is_equal(row, symbol):
                 return name
         raise PlantError(
-            f'plant {plant.name}: output "{position}" is no state, so that its difference over samples is not known '
-            f"to the model; give one of {', '.join(plant.states)}"
+            f'output "{position}" is no state, so that its difference over samples is not known '
+            f"to the model; give one of {', '.join(plant.states)}",
+            plant=plant.name,
         )
     if position not in plant.states:
         positions = [*plant.states, *plant.outputs]
