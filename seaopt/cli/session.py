@@ -110,14 +110,18 @@ class Session:
         self.explain = explain
         self.workers = workers
         self.executor: Executor | None = None
-        self.results: dict[str, Any] = {}
+        self._stages = Stages(self.problem)
         self.written: list[Path] = []
-        self._experiments: tuple[Experiment, ...] | None = None
         self._said: set[str] = set()
         self._console = Terminal(stderr=True)
         if self.problem.refused:
             self._say_once("warning", [f"{self.problem.refused}; a design refuses this"])
         self._say_once("note", self.problem.notes)
+
+    @property
+    def results(self) -> dict[str, Any]:
+        """The results that are there, by stage."""
+        return self._stages.results
 
     def plan_stages(self) -> list[str]:
         """Return the stages that the problem has what it takes for."""
@@ -180,9 +184,7 @@ class Session:
 
     def experiments(self) -> tuple[Experiment, ...]:
         """Return the problem's experiments, read or made once."""
-        if self._experiments is None:
-            self._experiments = self.problem.experiments()
-        return self._experiments
+        return self._stages.experiments
 
     def parameters(self) -> Fit | ParameterSet:
         """Return the fit of this run or of the folder; the file's own values if nothing is designed on a model."""
@@ -379,7 +381,7 @@ class Session:
         """Return the fit of the problem with what explains its logs, which is the problem from here on."""
         starts = [finding.where for finding in before.errors if finding.kind == "initial"]
         self.problem, lines = adopt(self.problem, trial, starts)
-        self._experiments = None
+        self._stages = Stages(self.problem, fit=before)
         path = self.folder / EXPLAINED
         write_text(path, lines + "\n")
         self.written.append(path)
@@ -513,16 +515,10 @@ class Session:
     def _expected(self) -> list[tuple[bool, str]]:
         """Return what came of each expectation of the problem file."""
         expectations = list_expectations(self.problem)
-        if expectations and isinstance(fit := self.results.get("fit"), Fit) and "scores" not in self.results:
-            self.results["scores"] = score_problem(self.problem, fit, self.experiments())
-        one_law = self.problem.schedule is None
-        results = Stages(
-            self.problem,
-            fit=self.results.get("fit"),
-            scores=self.results.get("scores", []),
-            controller=self.results.get("tune") if one_law else None,
-            certificate=self.results.get("certify") if one_law else None,
-        )
+        if expectations and isinstance(self.results.get("fit"), Fit):
+            self._stages.scores  # noqa: B018 - makes them, once
+        there = {"fit": None, "scores": [], "tune": None, "certify": None} | self.results
+        results = Stages(self.problem, **there)  # of which nothing more is made
         return [expectation.check(results) for expectation in expectations]
 
     def _verdicts(self, stage: str) -> list[Verdict]:

@@ -485,6 +485,9 @@ def _add_logs(problem: Problem, source: Fit | ParameterSet) -> tuple[Fit | Param
     return replace(source, experiments=fitted, validation=scored, holdout=problem.table.fit.holdout), ()
 
 
+_STAGE_OF = {"controller": "tune", "certificate": "certify"}  # what makes a result that is named otherwise
+
+
 class Stages:
     """A problem's results, each made once, when it is first asked for; an error that making one raised is kept too.
 
@@ -505,32 +508,33 @@ class Stages:
 
     def __init__(self, problem: Problem, **made: Any) -> None:
         self.problem = problem
-        self._made = made
+        self.results = {_STAGE_OF.get(name, name): result for name, result in made.items()}  # by stage
 
     @property
     def fit(self) -> Fit | None:
         """The fit; None of a problem without experiments."""
         fitted = self.problem.table.experiment
-        return self._keep("fit", lambda: fit_problem(self.problem, self._experiments) if fitted else None)
+        return self._keep("fit", lambda: fit_problem(self.problem, self.experiments) if fitted else None)
 
     @property
     def scores(self) -> list[ModelledOutputs]:
         """The predictions of what was not fitted."""
         fit = self.fit
-        return self._keep("scores", lambda: [] if fit is None else score_problem(self.problem, fit, self._experiments))
+        return self._keep("scores", lambda: [] if fit is None else score_problem(self.problem, fit, self.experiments))
 
     @property
     def controller(self) -> Controller | None:
         """The controller; None where the problem asks for none, or for a schedule, or the fit allows none."""
-        return self._keep("controller", self._tune)
+        return None if self.problem.schedule else self._keep("tune", self._tune)
 
     @property
     def certificate(self) -> Certificate | None:
         """The certificate of the controller; None where there is none."""
-        return self._keep("certificate", self._certify)
+        return None if self.problem.schedule else self._keep("certify", self._certify)
 
     @property
-    def _experiments(self) -> tuple[Experiment, ...]:
+    def experiments(self) -> tuple[Experiment, ...]:
+        """The problem's experiments, read or made once."""
         return self._keep("experiments", self.problem.experiments)
 
     @property
@@ -540,7 +544,7 @@ class Stages:
 
     def _tune(self) -> Controller | None:
         problem = self.problem
-        if problem.spec is None or problem.schedule or (self.fit is not None and not can_design(problem, self.fit)):
+        if problem.spec is None or (self.fit is not None and not can_design(problem, self.fit)):
             return None
         tuned = tune_problem(problem, self._source)
         tuned = tuned.controller if isinstance(tuned, JointTuning) else tuned
@@ -555,12 +559,12 @@ class Stages:
         return certificate
 
     def _keep(self, name: str, make: Callable[[], Any]) -> Any:
-        if name not in self._made:
+        if name not in self.results:
             try:
-                self._made[name] = make()
+                self.results[name] = make()
             except SeaoptError as error:
-                self._made[name] = error
-        result = self._made[name]
+                self.results[name] = error
+        result = self.results[name]
         if isinstance(result, SeaoptError):
             raise result
         return result
