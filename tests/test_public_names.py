@@ -34,7 +34,7 @@ def list_public(package):
 def test_the_names_of_the_package_are_those_that_type_checkers_see():
     tree = ast.parse(Path(so.__file__).read_text(encoding="utf-8"))
     (typed,) = (node for node in tree.body if isinstance(node, ast.If))
-    names = [alias.asname for line in typed.body for alias in line.names]
+    names = [alias.name for line in typed.body for alias in line.names]
     assert sorted(names) == sorted(so.__all__) and len(so.__all__) == len(set(so.__all__))
     for name in so.__all__:
         assert getattr(so, name) is not None

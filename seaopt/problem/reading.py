@@ -116,8 +116,8 @@ def _make_plants(tables: Mapping[str, AnyPlant]) -> dict[str, Plant]:
             stated = isinstance(table, EquationsTable)
             plants[name] = make_plant(name, table, plants) if stated else _make_plant_of_kind(table)
         except SeaoptError as error:
-            named = isinstance(error, PlantError) and error.plant == name
-            raise type(error)(f"plant.{name}: {error.reason if named else error}") from error
+            text = error.reason if isinstance(error, PlantError) and error.plant == name else str(error)
+            raise type(error)(f"plant.{name}: {text}") from error
     return {name: plants[name] for name in tables}
 
 
