@@ -16,14 +16,7 @@ from seaopt.errors import SeaoptError
 from seaopt.machine.alternatives import Alternative, Edited, EditedGain, list_alternatives
 from seaopt.machine.gains.edited_table import Edit, list_edits
 from seaopt.machine.gains.free_gains import find_same, fit_gains, make_law
-from seaopt.machine.stepped import (
-    Match,
-    Others,
-    Setting,
-    count_head,
-    find_at_limit,
-    play,
-)
+from seaopt.machine.stepped import Match, Others, Setting, count_head, find_at_limit, play
 from seaopt.records import record
 
 WINDOW = 2000  # rows on which causes are tried, about the largest mismatch

@@ -92,8 +92,7 @@ class SeriesSpring:
     unit: str = option("Of the deflection: m or rad.")
     stiffness: str | None = option("Parameter that is its stiffness, where one is.", default=None)
     pull: StateExpression | None = option(
-        "What it pulls with, in terms of states and parameters; stiffness times deflection if left out.",
-        default=None,
+        "What it pulls with, in terms of states and parameters; stiffness times deflection if left out.", default=None
     )
     mass: str | None = option(
         "Derived figure: what swings on the spring, which (16) of Orekhov et al. 2015 reads from a second-order "

@@ -305,13 +305,7 @@ def _fold(
 
 
 def _folded_trajectory(
-    model: Model,
-    segment: Segment,
-    point: Point,
-    forcing: Float[np.ndarray, "n w"],
-    x0: VectorX,
-    *,
-    changes: bool,
+    model: Model, segment: Segment, point: Point, forcing: Float[np.ndarray, "n w"], x0: VectorX, *, changes: bool
 ) -> tuple[Trajectory, Float[np.ndarray, "n nx"] | None]:
     """Return the trace of a nonlinear plant, or of one whose state each prediction error corrects, and by how much
     steps of half the length change its states, if that is wanted.

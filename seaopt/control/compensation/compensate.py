@@ -12,12 +12,7 @@ from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.friction import take_friction_out
 from seaopt.control.loops.compensation.ripple_term import CompensateRipple
 from seaopt.control.loops.compensation.stability import CompensationMargin, SpeedReading, compensation_margin
-from seaopt.control.loops.compensation.terms import (
-    CompensateFriction,
-    CompensateGravity,
-    Compensation,
-    FrictionTerm,
-)
+from seaopt.control.loops.compensation.terms import CompensateFriction, CompensateGravity, Compensation, FrictionTerm
 from seaopt.control.loops.friction_loop import FrictionLoop
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet

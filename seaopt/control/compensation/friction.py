@@ -20,13 +20,7 @@ from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant, state_space
-from seaopt.plants.friction import (
-    SAMPLED_SPEEDS,
-    SLIDING,
-    SMOOTHED,
-    friction_matrices,
-    friction_states,
-)
+from seaopt.plants.friction import SAMPLED_SPEEDS, SLIDING, SMOOTHED, friction_matrices, friction_states
 from seaopt.plants.roles import Friction
 from seaopt.records import record
 

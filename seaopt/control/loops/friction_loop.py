@@ -26,13 +26,7 @@ from seaopt.control.loops.sampled_plant import (
 from seaopt.control.systems.resolvent import Resolvent
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
-from seaopt.plants.friction import (
-    SLIDING,
-    find_bristle_stiffness,
-    friction_matrices,
-    friction_slopes,
-    friction_states,
-)
+from seaopt.plants.friction import SLIDING, find_bristle_stiffness, friction_matrices, friction_slopes, friction_states
 from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.signals import MatrixNN, VectorM, VectorN

@@ -67,14 +67,7 @@ from seaopt.control.mpc.quadratic_program import (
     stack_hessian,
 )
 from seaopt.control.mpc.spec import MPCSpec
-from seaopt.control.mpc.step import (
-    MPCState,
-    MPCStep,
-    ReadsLink,
-    add_terms,
-    read_references,
-    shape_references,
-)
+from seaopt.control.mpc.step import MPCState, MPCStep, ReadsLink, add_terms, read_references, shape_references
 from seaopt.control.tuning.possible_bandwidths import find_end, list_steps
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit

@@ -12,13 +12,7 @@ from jaxtyping import Float
 
 from seaopt.errors import LogError, require_number, suggestion
 from seaopt.logs.log.alignment import Hold, Linear, Nearest, Readings, Rule
-from seaopt.logs.quality.clock import (
-    advise_clock,
-    sample_rate_hz,
-    shorten_rate,
-    split_at_gaps,
-    timestamp_resolution,
-)
+from seaopt.logs.quality.clock import advise_clock, sample_rate_hz, shorten_rate, split_at_gaps, timestamp_resolution
 from seaopt.signals import Recording, VectorK, VectorM, VectorN
 
 AROUND = 20  # samples ahead that tell a gap from a late stamp

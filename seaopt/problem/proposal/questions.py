@@ -81,15 +81,7 @@ class Interview:
         self.questions: list[Question] = []
         self.assumed: dict[str, str] = {}  # why, by key
 
-    def ask(
-        self,
-        key: str,
-        label: str,
-        guess: str,
-        why: str = "",
-        choices: Sequence[str] = (),
-        **options: Any,
-    ) -> str:
+    def ask(self, key: str, label: str, guess: str, why: str = "", choices: Sequence[str] = (), **options: Any) -> str:
         """Return the answer to a question, or its guess; `options` are further fields of `Question`."""
         question = Question(key=key, label=label, guess=guess, why=why, choices=tuple(choices), **options)
         if all(question.key != other.key for other in self.questions):

@@ -23,10 +23,7 @@ from seaopt.robustness.bounds.bracket import Bracket
 from seaopt.robustness.bounds.stretch import StretchBound
 from seaopt.robustness.certificate.cases import Cases
 from seaopt.robustness.certificate.certificate import NO_MODEL, ROBUSTNESS_SCHEMA, Certificate
-from seaopt.robustness.certificate.compensation import (
-    FRICTION_COMPENSATION,
-    find_nominal_compensation,
-)
+from seaopt.robustness.certificate.compensation import FRICTION_COMPENSATION, find_nominal_compensation
 from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import MarginDraws, find_nominal_margins
 from seaopt.robustness.certificate.impedance import ImpedanceDraws, certify_impedance
