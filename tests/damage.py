@@ -16,3 +16,16 @@ def damage(content, place, key, value):
     assert table[key] != value
     table[key] = value
     return seal({name: each for name, each in damaged.items() if name != "made_from"}), damaged
+
+
+def put(content, keys, value):
+    """Return content with another value at the end of some keys, without it if that is `...`."""
+    changed = copy.deepcopy(content)
+    table = changed
+    for key in keys[:-1]:
+        table = table[key]
+    if value is ...:
+        del table[keys[-1]]
+    else:
+        table[keys[-1]] = value
+    return changed

@@ -24,10 +24,11 @@ from seaopt.control.compensation.gravity import make_gravity_term
 from seaopt.control.deploy.export import export
 from seaopt.control.running.equilibrium import equilibrium
 from seaopt.files import to_json
+from tests import hanging_link
 from tests.c_code import STRICT
+from tests.hanging_link import HELD, KNEE
 
-KNEE, HELD = so.plants.rotary(link="pendulum"), so.plants.rotary(link="locked")
-VALUES = KNEE.defaults.update(N=50.0, k_s=300.0, J_l=0.3, d_l=0.5, m=4.0, L=0.2, f_c=0.002)
+VALUES = hanging_link.VALUES.update(f_c=0.002)
 WEIGHT = 4.0 * 9.81 * 0.2
 
 

@@ -29,15 +29,14 @@ from seaopt.control.deploy.export import export
 from seaopt.control.running.equilibrium import equilibrium
 from seaopt.files import to_json
 from tests.c_code import STRICT
+from tests.hanging_link import HELD, KNEE, VALUES, tune_held
 
-KNEE, HELD = so.plants.rotary(link="pendulum"), so.plants.rotary(link="locked")
-VALUES = KNEE.defaults.update(N=50.0, k_s=300.0, J_l=0.3, d_l=0.5, m=4.0, L=0.2, f_c=0.0)
 RIPPLE = CompensateRipple(cycles=(6, 1, 42), cos=(0.1, 0.02, 0.0), sin=(-0.05, 0.0, 0.01), fraction=1.0)
 
 
 @pytest.fixture(scope="module")
 def plain():
-    return so.tune(HELD, VALUES, so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6))
+    return tune_held()
 
 
 def series(asked, angle):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 import seaopt as so
 from seaopt.errors import FileError
 from seaopt.files import to_json
+from tests.damage import put
 
 CONTENT = {
     "schema": "seaopt/fit/2", "met": True, "findings": [],
@@ -66,16 +66,8 @@ def test_null_is_infinite_where_json_has_no_infinity():
     ],
 )
 def test_a_mistake_is_one_line_with_place_value_and_remedy(keys, value, words):
-    content = copy.deepcopy(CONTENT)
-    table = content
-    for key in keys[:-1]:
-        table = table[key]
-    if value is ...:
-        del table[keys[-1]]
-    else:
-        table[keys[-1]] = value
     with pytest.raises(FileError) as raised:
-        so.Fit.from_dict(content)
+        so.Fit.from_dict(put(CONTENT, keys, value))
     message = str(raised.value)
     assert message.startswith("fit.json: ") and words in message
     assert message.endswith("; run the fit again") and "\n" not in message

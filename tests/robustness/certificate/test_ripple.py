@@ -10,14 +10,12 @@ import pytest
 import seaopt as so
 from seaopt.control import CompensateGravity, CompensateRipple, SampledLoop, add_compensation, run_loop, runnable
 from seaopt.robustness.certificate.compensation import NEUTRAL, choose_worst, measure_ripple
-
-KNEE, HELD = so.plants.rotary(link="pendulum"), so.plants.rotary(link="locked")
-VALUES = KNEE.defaults.update(N=50.0, k_s=300.0, J_l=0.3, d_l=0.5, m=4.0, L=0.2, f_c=0.0)
+from tests.hanging_link import HELD, KNEE, VALUES, tune_held
 
 
 @pytest.fixture(scope="module")
 def plain():
-    return so.tune(HELD, VALUES, so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6))
+    return tune_held()
 
 
 def find_worst_ripple(controller, plant, nominal, draws):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 
 from seaopt.errors import FileError
 from seaopt.files import seal
 from seaopt.robustness.certificate.stored import read_certificate
+from tests.damage import put
 
 CONTENT = {
     "schema": "seaopt/robustness/3", "passed": True,
@@ -43,16 +42,8 @@ def test_null_is_infinite():
     ],
 )
 def test_a_mistake_is_one_line_with_place_value_and_remedy(keys, value, words):
-    content = copy.deepcopy(CONTENT)
-    table = content
-    for key in keys[:-1]:
-        table = table[key]
-    if value is ...:
-        del table[keys[-1]]
-    else:
-        table[keys[-1]] = value
     with pytest.raises(FileError) as raised:
-        read_certificate(seal(content))
+        read_certificate(seal(put(CONTENT, keys, value)))
     message = str(raised.value)
     assert message.startswith("robustness.json: ") and words in message
     assert message.endswith("; certify again") and "\n" not in message
