@@ -3,6 +3,11 @@
 What a candidate gains is the logarithm of its likelihood over the fit's, at each one's own residuals. The gain counts
 only beyond what chance gives a residual of this colour. The search may end before all was tried: so what a score speaks
 for is tried first, and a refit that the budget cuts off is not compared with any.
+
+A damper c in a spring of stiffness k puts its force ahead of its deflection by c/k, as a late stamp of the deflection
+would; what else it does is small: it damps a motion that friction damps as well, and its force grows as (w c/k)^2/2.
+Over samples that both are fitted to, the likelihoods of such a pair differ by little of what either gains. So each is
+fitted to the first part of the logs, from where it is, and compared over the rest.
 """
 
 from __future__ import annotations
@@ -15,7 +20,6 @@ from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.candidates import Candidate, list_candidates
-from seaopt.estimation.judgement.held_out import compare_held_out
 from seaopt.estimation.judgement.hypothesis_search import Refit
 from seaopt.estimation.judgement.score_test import ScoreTest
 from seaopt.estimation.judgement.second_log import FAR
@@ -57,6 +61,8 @@ HALVED = 0.5  # of a residual's power: what leaves less is another explanation, 
 MOVED_STDS, MOVED_SHARE = 5.0, 0.01  # an estimate that another explanation moves so far was not what it said
 HOPELESS, PATIENCE = 1.4, 8  # a misfit that is larger by so much of the samples, after so many iterations, stays so
 STILL, SLIGHT = 5, 0.1  # iterations in a row that gain so little of misfit end a refit: where a delay's slope has kinks
+HELD_OUT = 0.3  # of each log, its end, where the fit holds out nothing
+BLOCKS = 20  # of each log's end, whose differences are taken for independent
 SURE = 2.5  # standard deviations by which one of two is nearer to held-out samples
 COMPARES = 8  # evaluations that are kept for that: two fits near their minima take four
 PROMISES = 0.5  # of a gain that counts: what shows with coarse steps, the same in fit and refit, before finer are made
@@ -385,3 +391,39 @@ def _weigh(
         problem=problem,
         z=evaluation.z,
     )
+
+
+def compare_held_out(
+    first: tuple[FitProblem, Float[np.ndarray, " n"]], second: tuple[FitProblem, Float[np.ndarray, " m"]]
+) -> float:
+    """Return by how many standard deviations the first minimum is nearer than the second to what neither was fitted to.
+    Both are of the same outputs of the same logs, which either may have as experiments of their own.
+    """
+    pairs = zip(_list_held_out(*first), _list_held_out(*second), strict=True)
+    blocks = np.zeros(BLOCKS)
+    for ours, theirs in pairs:
+        nearer = (theirs - ours) / min(np.nanmean(ours), np.nanmean(theirs))
+        blocks += [np.nansum(block) for block in np.array_split(nearer, BLOCKS)]
+    return float(np.mean(blocks) / max(np.std(blocks, ddof=1) / np.sqrt(BLOCKS), 1e-300))
+
+
+def _list_held_out(problem: FitProblem, z: Vector) -> list[Float[np.ndarray, " k"]]:
+    """Return each output's squared residuals over the last part of its log, at the minimum over the rest."""
+    if not problem.holdout:
+        rest = pose_problem(
+            tuple(e.data for e in problem.experiments),
+            problem.params,
+            loss=problem.loss,
+            band_hz=problem.band_hz,
+            holdout=HELD_OUT,
+        )
+        rest = copy_steps(rest.with_values("sigma", {e.name: e.sigma for e in problem.experiments}), problem)
+        solved = settle_roughly(rest, rest.evaluate(z), checked=True)
+        problem, z = solved.problem, solved.solution.evaluation.z
+    residuals = compute_residuals(problem, z)
+    rows: list[Float[np.ndarray, " k"]] = []
+    for experiment in problem.experiments:
+        parts = zip(experiment.segments, residuals[experiment.name].segments, strict=True)
+        squares = [left.raw[part.samples.keep[0] == 0] ** 2 for part, left in parts]
+        rows += list(np.concatenate(squares).T)
+    return rows

@@ -31,6 +31,7 @@ from seaopt import welch
 from seaopt.estimation.problem.chance import exceeds
 from seaopt.estimation.problem.correlation import find_quick_size_within
 from seaopt.estimation.problem.fit_experiment import FitExperiment
+from seaopt.estimation.problem.noise_floor import NoiseFloor
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.estimation.result.model_error import bridge
 from seaopt.records import record
@@ -38,6 +39,7 @@ from seaopt.signals import median
 
 STRETCHES = (16, 64)  # how many half-overlapping pairs of them the samples make
 SHORTEST = 32  # samples of a stretch
+FEWEST_LINES = 4  # of an octave of which a mean is told
 FEWEST, MOST = 6, 256  # stretches that are averaged
 TOGETHER = 16384  # samples of as many stretches as are transformed at once: they stay in the cache
 OUTLIER = 4.0  # robust standard deviations beyond which a residual is an outlier of its spectrum
@@ -57,6 +59,52 @@ class CoherentShare:
     p: float  # probability that a residual that follows no input has so coherent an octave (Bonferroni's bound)
     band_hz: tuple[float, float]  # the octave whose residual is the least likely to be chance
     power: float  # power of the residual that the inputs account for, over the output's that they account for
+
+
+@record(eq=False)
+class Octave:
+    """What of an output's power follows the inputs in an octave, and how loud these are."""
+
+    band_hz: tuple[float, float]
+    lines: int
+    follows: float  # share of the output's power, the mean of its lines
+    noise: float  # its sensor's over the output's power
+    input: float  # power of the inputs' lines over that of the last octave's
+
+
+def measure_octaves(experiment: FitExperiment, residuals: ExperimentResiduals, floor: NoiseFloor) -> Iterator[Octave]:
+    """Yield what the inputs account for of each output, octave by octave; nothing where the log is too short to tell.
+    `floor`: of the residuals.
+    """
+    inputs, outputs = _gather(experiment, residuals)
+    total, ny = sum(rows.shape[1] for rows in inputs), len(experiment.data.outputs)
+    if not inputs:
+        return
+    rng, std = np.random.default_rng(0), floor.noise * experiment.sigma
+    beside = (std[:, None] * rng.normal(size=(ny, rows.shape[1])) for rows in outputs)
+    signals = [np.vstack([y[:ny], noise, u]) for u, y, noise in zip(inputs, outputs, beside, strict=True)]
+    length = 2 * find_quick_size_within(min(max(2 * total // STRETCHES[0], SHORTEST), total) // 2)
+    spectra = _make_spectra(inputs, signals, length, experiment)
+    if spectra is None:
+        return
+    f, power = spectra.frequency_hz, np.maximum(spectra.power, 1e-300)
+    chance = spectra.inputs / spectra.averages
+    follows = (spectra.coherent / power - chance) / (1.0 - chance)
+    loud = np.sum(power[:, 2 * ny :], axis=1)
+    octave = np.floor(np.log2(f[-1] / f)).astype(int)
+    last = float(np.mean(loud[octave == 0]))
+    for o in range(ny):
+        for number in range(min(int(octave[0]), OCTAVES)):
+            lines = octave == number
+            if np.count_nonzero(lines) < FEWEST_LINES:
+                continue
+            yield Octave(
+                band_hz=(float(f[lines][0]), float(f[lines][-1])),
+                lines=int(np.count_nonzero(lines)),
+                follows=float(np.mean(follows[lines, o])),
+                noise=float(np.mean(power[lines, ny + o]) / np.mean(power[lines, o])),
+                input=float(np.mean(loud[lines])) / last,
+            )
 
 
 def measure_coherence(experiment: FitExperiment, residuals: ExperimentResiduals) -> dict[str, CoherentShare]:

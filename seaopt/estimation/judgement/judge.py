@@ -22,7 +22,8 @@ import numpy as np
 from seaopt.estimation.judgement.another_start import find_other_minimum
 from seaopt.estimation.judgement.causes import Explanation, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
-from seaopt.estimation.judgement.hypothesis_search import TriedHypotheses, search_hypotheses
+from seaopt.estimation.judgement.command_rate import find_unlogged_command
+from seaopt.estimation.judgement.hypothesis_search import REMOVED, TriedHypotheses, search_hypotheses
 from seaopt.estimation.judgement.intervals import (
     find_excesses,
     find_rough,
@@ -115,7 +116,10 @@ def judge(
     fit = compare_logs(widen(_state_excess(fit, error.excess), error.matrix), validation)
     fit = replace(fit, silent=find_silent(fit, freed))
     with limit_evaluations(TESTS * evaluations):
-        another = list(find_other_minimum(fit))
+        command = find_unlogged_command(fit, residuals, floors, error.excess)
+    known = command is not None and command.certain  # what is wrong
+    with limit_evaluations(TESTS * evaluations):
+        another = [] if known else list(find_other_minimum(fit))
     findings = [
         *_find_unexplained(fit, shares, error.excess),
         *_find_held_out(fit),
@@ -131,12 +135,19 @@ def judge(
         *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each))), minimum),
         *another,
     ]
+    if command is not None and known:
+        return _conclude(replace(fit, findings=order_findings([*findings, command.finding, *find_step_error(fit)])))
     suspects = {name: test for name, test in _run_tests(fit, minimum, freed).items() if test.p < DOUBTFUL}
+    if command is not None:
+        evaluations = EVALUATIONS  # what brings a random force is hardly among the causes
     budget = EvaluationBudget.begin((OF_HYPOTHESES + OF_CAUSES) * evaluations, minimum.problem.count_work(minimum.z))
     with budget.enforce():
         fit, findings, search = _search_causes(
             fit, findings, residuals, floors, error, suspects, alternatives, budget, evaluations, trying
         )
+    if command is not None and not any(refit.excess <= REMOVED for refit in search.able):
+        findings = [*(each for each in findings if each.kind != "cause"), command.finding]
+        search = search.yield_to_another()
     findings += find_step_error(fit)  # at last, for no cause explains it
     return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))
 

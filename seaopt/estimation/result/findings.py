@@ -29,11 +29,13 @@ class FitFinding:
         Key(field="proposal", name="proposal", omit_none=True),
         Key(field="python", name="python", omit_none=True),
         Key(field="sticks", name="sticks", omit_none=True),
+        Key(field="rate_hz", name="rate_hz", omit_none=True),
     )
 
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
-    # for programs: "bound", "budget", "cause", "delay", "event", "excess", "explained", "fixed", "guess", "held_out",
-    # "initial", "noise", "quantisation", "range", "residual", "rough", "samples", "sharp", "starts", "step", "unjudged"
+    # for programs: "bound", "budget", "cause", "command", "delay", "event", "excess", "explained", "fixed", "guess",
+    # "held_out", "initial", "noise", "quantisation", "range", "residual", "rough", "samples", "sharp", "starts",
+    # "step", "unjudged"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy
@@ -46,6 +48,7 @@ class FitFinding:
     proposal: str | None = None
     python: str | None = None
     sticks: bool | None = None  # whether a "cause" is friction that is smoothed where it jumps at rest
+    rate_hz: float | None = None  # at which a "command" was held, that the log has only in part
 
 
 @record
