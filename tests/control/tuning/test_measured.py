@@ -225,7 +225,7 @@ def test_a_law_tuned_on_a_log_alone_keeps_its_limits_on_the_plant(bench):
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [400.0, 1000.0, 2000.0])
 def test_laws_tuned_on_logs_keep_their_limits_on_the_plant(bench, rate):
-    for seed in range(200, 207):
+    for seed in range(200, 204):
         controller, _ = bench.tune_on_log(seed, rate, 164.0)
         assert controller.feasible
         assert bench.keeps(bench.judge(controller), bench.SPEC)
