@@ -45,7 +45,7 @@ def test_the_std_has_that_of_what_noise_makes_of_the_model(stage):
 def test_right_machines_are_off_by_what_is_stated_and_none_is_refused(stage):
     first, values, bench = stage
     misfits = list[float]()
-    for seed in range(20):
+    for seed in range(8):
         log = bench.log(Machine.of_knee(values), first.excitation.reference, noise=NOISE, seed=seed)
         result = so.accept(first.controller, [log])
         assert result.replayed and result.differences.inside and not result.differences.found, result
