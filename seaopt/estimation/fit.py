@@ -202,7 +202,7 @@ def _count_iterations(progress: Progress) -> Callback:
     def tell(where: str, cost: float) -> None:
         nonlocal count
         count += 1
-        progress(f"iteration {count}, cost {cost:.6g} ({where})", count / (count + USUAL_ITERATIONS))
+        progress(f"{where}, iteration {count}, cost {cost:.6g}", count / (count + USUAL_ITERATIONS))
 
     return tell
 

@@ -177,6 +177,7 @@ class _Search:
         self.silent = {effect.part for effect in fit.silent if first <= REMOVED}
         self.base = minimum.problem.evaluate(minimum.z)
         self.ended = False
+        self.tried = set[tuple[Change | None, Hypothesis]]()  # also those that are refused
 
     def run(self) -> list[Refit]:
         """Return the refits of single hypotheses, and of pairs with the best of them where none suffices."""
@@ -253,8 +254,9 @@ class _Search:
         hypotheses: Sequence[Hypothesis] = HYPOTHESES,
     ) -> Iterator[Refit]:
         """Yield the refits of each hypothesis that is not there yet, as long as the budget lasts."""
-        for hypothesis in hypotheses:
-            if hypothesis.part in self.silent or (before is not None and {*before.hypotheses, hypothesis} in done):
+        for number, hypothesis in enumerate(hypotheses, start=1):
+            known = before is not None and {*before.hypotheses, hypothesis} in done
+            if hypothesis.part in self.silent or known or (before, hypothesis) in self.tried:
                 continue
             change = change_plants(hypothesis, experiments, params, self.sizes, before)
             if change is None:
@@ -262,7 +264,10 @@ class _Search:
             if self.budget.left <= (0.0 if before is None else 2.0 * ROUND):  # a pair leaves what settles the best
                 self.ended = True
                 return
-            self.progress(f"trying cause: {hypothesis.effect}", self.budget.share)
+            self.tried.add((before, hypothesis))
+            beside = "" if before is None else f", beside {before.effect}"
+            told = f"trying cause {number} of {len(hypotheses)}: {hypothesis.effect}{beside}"
+            self.progress(told, self.budget.share)
             refit = _refit(change, problem, fitted, self.helps, self.base, self.budget)
             if refit is not None:
                 yield refit

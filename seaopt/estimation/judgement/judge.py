@@ -118,6 +118,7 @@ def judge(
     with limit_evaluations(TESTS * evaluations):
         command = find_unlogged_command(fit, residuals, floors, error.excess)
     known = command is not None and command.certain  # what is wrong
+    testing(f"trying another start, at most {evaluations} evaluations", 0.5)
     with limit_evaluations(TESTS * evaluations):
         another = [] if known else list(find_other_minimum(fit))
     findings = [

@@ -24,7 +24,7 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.noise_floor import measure_most
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.problem.unknowns import Unknowns
-from seaopt.estimation.solver.least_squares import Callback
+from seaopt.estimation.solver.least_squares import Callback, name_phase
 from seaopt.estimation.solver.loosening import loosen_start
 from seaopt.estimation.solver.settle import settle_roughly
 
@@ -50,14 +50,15 @@ def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | No
     near = replace(problem, unknowns=replace(unknowns, prior_std=prior_std))
     further = list_starts(unknowns, start.z, OFF, np.random.default_rng(0))
     followed, added, failed = 0, SHORTEST, 0
-    for _ in range(TRIES):
+    for number in range(1, TRIES + 1):
         if (followed + added) * np.sqrt(2.0) >= longest:
             break
         counts = [before + followed + added for before in quiet]
         parts = tuple(e.take_first(count) for e, count in zip(near.experiments, counts, strict=True))
         if not all(np.all(each.count_weighted()) for each in parts):
             return None  # an output is missing at first: what is followed would be long at once
-        found = _follow(replace(near, experiments=parts), z, callback)
+        phase = f"part {number} of {TRIES}, {followed + added} of {longest} samples"
+        found = _follow(replace(near, experiments=parts), z, name_phase(callback, phase))
         if found is not None:
             followed, z, failed = followed + added, found, 0
             added = min(2 * added, followed)

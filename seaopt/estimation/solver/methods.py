@@ -77,7 +77,7 @@ class OutputError(Method):
 
     def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle from the best start that can be found."""
-        best, guesses = find_start(problem, self)
+        best, guesses = find_start(problem, self, callback)
         best, spent = _approach_waves(problem, best, callback) if self.search else (best, 0)
         if self.search and any(e.model.sticks for e in problem.experiments):
             best, more = _approach_sticking(problem, best, self, callback)
@@ -88,10 +88,11 @@ class OutputError(Method):
             return solved
         solved = _bring_back(solved, self, callback)
         doubtful = problem.seeks_play or _is_doubtful(solved, guesses)
-        for start in _further_starts(problem, best, guesses, self) if doubtful else ():
+        for start in _further_starts(problem, best, guesses, self, callback) if doubtful else ():
             evaluation = problem.evaluate(start)
-            if not _is_hopeless(problem, evaluation, solved):
-                other = settle(problem, evaluation, self.max_iterations, name_phase(callback, "another start"))
+            tell = name_phase(callback, "another start")
+            if not _is_hopeless(problem, evaluation, solved, tell):
+                other = settle(problem, evaluation, self.max_iterations, tell)
                 solved = min(solved, other, key=lambda each: each.misfit)
                 if not _is_doubtful(solved, guesses):
                     break
@@ -133,10 +134,12 @@ class MultipleShooting(Method):
             check_shots(
                 experiment.data, experiment.longest, self.segments, f"MultipleShooting(segments={self.segments})"
             )
-        start, _ = find_start(problem, self)
+        start, _ = find_start(problem, self, callback)
         shared, first = problem.unknowns.shared, start.z.copy()
         if self.search and (not np.isfinite(start.cost) or explains_little(problem, start.power)):
-            predicting = find_predicting_start(problem, first, self.max_iterations)
+            predicting = find_predicting_start(
+                problem, first, self.max_iterations, name_phase(callback, "looking for a start")
+            )
             first = first if predicting is None else predicting
         z = first.copy()
         for number, theta in enumerate(grow_shots(problem, first, self.segments, callback)):
@@ -200,12 +203,17 @@ class PredictionError(Method):
 
     def solve(self, problem: FitProblem, callback: Callback | None) -> Solved:
         """Settle with a filter that hardly trusts the plant, then with one whose noise is estimated."""
-        best, _ = find_start(problem, self)
+        best, _ = find_start(problem, self, callback)
         solved: Solved | None = None
         follows = problem.all_linear and not explains_little(problem, best.power)
         for start in (*([best.z] if np.isfinite(best.cost) else []), problem.unknowns.start):
             # A plant that already simulates well would be led away: held to the log, it may do without its input.
-            z = best.z if follows and start is best.z else find_predicting_start(problem, start, self.max_iterations)
+            tell = name_phase(callback, "looking for a start")
+            z = (
+                best.z
+                if follows and start is best.z
+                else find_predicting_start(problem, start, self.max_iterations, tell)
+            )
             other = None if z is None else self._settle_predicting(problem, z, callback)
             if other is not None and (solved is None or other.misfit < solved.misfit):
                 solved = other
@@ -234,7 +242,9 @@ class PredictionError(Method):
         return solved
 
 
-def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Vector]]:
+def find_start(
+    problem: FitProblem, method: Method, callback: Callback | None = None
+) -> tuple[Evaluation, list[Vector]]:
     """Return the better of the given values and the best guess of the frequency responses, and all the guesses. A guess
     that matches the responses may still simulate badly: those of a lightly damped mode are blurred, and a mode a little
     off is out of phase after some periods. On short shots, or held to the log, such a guess finds the mode.
@@ -252,11 +262,12 @@ def find_start(problem: FitProblem, method: Method) -> tuple[Evaluation, list[Ve
     first = shift_start(problem, problem.evaluate(problem.unknowns.start))
     best = loosen_start(problem, first if guessed is None or guessed.cost > first.cost else guessed)
     if guesses and (matched or problem.all_linear) and explains_little(problem, best.power):
+        callback = name_phase(callback, "looking for a start")
         # Of a linear plant the best initial states of shots follow from one evaluation.
         z = (
-            find_start_on_shots(problem, guesses[0])
+            find_start_on_shots(problem, guesses[0], callback)
             if problem.all_linear
-            else find_predicting_start(problem, guesses[0], method.max_iterations)
+            else find_predicting_start(problem, guesses[0], method.max_iterations, callback)
         )
         best = best if z is None else min(best, problem.evaluate(z), key=lambda each: each.cost)
     return best, guesses
@@ -352,23 +363,26 @@ def _is_doubtful(solved: Solved, guesses: list[Vector]) -> bool:
     return explains_little(solved.problem, evaluation.power)
 
 
-def _is_hopeless(problem: FitProblem, start: Evaluation, best: Solved) -> bool:
+def _is_hopeless(problem: FitProblem, start: Evaluation, best: Solved, callback: Callback | None) -> bool:
     """Tell whether a start, settled roughly, explains little and no more than the best: most that go astray stay so. To
     find its minimum all the same takes the longest: where nothing is explained the search creeps, and simulations that
     run away ask for ever finer steps.
     """
     if not np.isfinite(best.misfit):
         return False
-    rough = settle_roughly(problem, start)
+    rough = settle_roughly(problem, start, callback)
     evaluation = rough.solution.evaluation
     astray = np.isfinite(evaluation.cost) and rough.misfit >= best.misfit
     return bool(astray) and explains_little(rough.problem, evaluation.power)
 
 
-def _further_starts(problem: FitProblem, best: Evaluation, guesses: list[Vector], method: Method) -> Iterator[Vector]:
+def _further_starts(
+    problem: FitProblem, best: Evaluation, guesses: list[Vector], method: Method, callback: Callback | None
+) -> Iterator[Vector]:
     """Yield further starts: predicting from the given values and from the best, then the other guesses."""
     for start in (problem.unknowns.start, best.z):
-        predicting = find_predicting_start(problem, start, method.max_iterations)
+        tell = name_phase(callback, "another start")
+        predicting = find_predicting_start(problem, start, method.max_iterations, tell)
         if predicting is not None:
             yield predicting
     yield from guesses[1:FURTHER]

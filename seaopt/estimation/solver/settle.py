@@ -164,7 +164,7 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
             unknowns.high,
             decrement=ROUGH if rough else decrement,
             max_iterations=max(max_iterations - iterations, 1),
-            callback=_tell_round(callback, problem, attempt + 1),
+            callback=_tell_round(callback, problem, attempt + 1, MAX_ROUNDS),
             follow=problem.follow if problem.straight and attempt else None,
             before=before,  # in true sigmas
             flat=flat,
@@ -196,8 +196,10 @@ def _settle(problem: FitProblem, start: Evaluation, max_iterations: int, callbac
     raise AssertionError  # the last attempt returns
 
 
-def _tell_round(callback: Callback | None, problem: FitProblem, number: int) -> Callable[[Evaluation], None] | None:
-    """Return what tells a callback of the round, and of unknowns that are on a bound."""
+def _tell_round(
+    callback: Callback | None, problem: FitProblem, number: int, most: int
+) -> Callable[[Evaluation], None] | None:
+    """Return what tells a callback of the round, of how many at most, and of unknowns that are on a bound."""
     if callback is None:
         return None
     unknowns = problem.unknowns
@@ -205,7 +207,9 @@ def _tell_round(callback: Callback | None, problem: FitProblem, number: int) -> 
 
     def tell(evaluation: Evaluation) -> None:
         at_bound = [name for name in unknowns.find_at_bound(evaluation.z) if name not in held]
-        callback(f"round {number}" + (f", {', '.join(at_bound)} at a bound" if at_bound else ""), evaluation.cost)
+        callback(
+            f"round {number} of {most}" + (f", {', '.join(at_bound)} at a bound" if at_bound else ""), evaluation.cost
+        )
 
     return tell
 
@@ -253,7 +257,7 @@ def settle_roughly(
             unknowns.high,
             decrement=NEAR,
             max_iterations=ROUGH_ITERATIONS,
-            callback=_tell_round(callback, problem, attempt + 1),
+            callback=_tell_round(callback, problem, attempt + 1, ROUGH_ROUNDS),
             flat=measure_flatness(problem),
             ends=ends,
         )

@@ -29,7 +29,7 @@ ROUNDS, ITERATIONS = 2, 25  # of each length; sigma is estimated before each rou
 NEAR = 1.0  # squared standard deviations to the minimum, near enough to go on from
 
 
-def find_start_on_shots(problem: FitProblem, start: Vector) -> Vector | None:
+def find_start_on_shots(problem: FitProblem, start: Vector, callback: Callback | None = None) -> Vector | None:
     """Return the unknowns of a linear plant with shared parameters that follow longer and longer shots of the logs.
     None where the logs are too short to be cut, or where the plant runs away even so.
     """
@@ -39,7 +39,7 @@ def find_start_on_shots(problem: FitProblem, start: Vector) -> Vector | None:
     shared, z = problem.unknowns.shared, start.copy()
     if samples < 2 * shortest:
         return None
-    for theta in grow_shots(problem, start, count):
+    for theta in grow_shots(problem, start, count, callback):
         if theta is None:
             return None
         z[:shared] = theta

@@ -44,20 +44,21 @@ def search_around(solved: Solved, seed: int, max_iterations: int, callback: Call
     lost = sticks and most > LOST
     if most <= NOISE or not (lost or strayed):
         return solved
-    callback, rng, best = name_phase(callback, "another start"), np.random.default_rng(seed), solved
+    rng, best = np.random.default_rng(seed), solved
     held = _hold_delays(problem) if lost else problem
     given = unknowns.start if lost else np.append(unknowns.start[:count], z[count:])
-    for start in islice(list_starts(unknowns, given, OFF, rng), STARTS):
-        rough = settle_roughly(held, held.evaluate(start), callback)
+    for number, start in enumerate(islice(list_starts(unknowns, given, OFF, rng), STARTS), start=1):
+        tell = name_phase(callback, f"another start, {number} of {STARTS}")
+        rough = settle_roughly(held, held.evaluate(start), tell)
         if lost:
-            rough = settle_roughly(problem, problem.evaluate(rough.solution.z), callback)
+            rough = settle_roughly(problem, problem.evaluate(rough.solution.z), tell)
         best = min(best, rough, key=lambda each: each.misfit)
         if best is rough and measure_most(rough.problem, rough.solution.z) <= NOISE:
             break
     if best is solved:
         return solved
     # With steps of its own: those of a minimum that explains little are too coarse.
-    other = settle(problem, problem.evaluate(best.solution.z), max_iterations, callback)
+    other = settle(problem, problem.evaluate(best.solution.z), max_iterations, name_phase(callback, "another start"))
     iterations = solved.solution.iterations + other.solution.iterations
     other = replace(other, solution=replace(other.solution, iterations=iterations))
     return min(solved, other, key=lambda each: each.misfit)

@@ -127,6 +127,26 @@ def test_a_search_for_causes_makes_at_most_five_times_the_evaluations_of_its_fit
         assert bool(notes) == ended
 
 
+def test_no_cause_is_tried_twice_from_the_same_start(monkeypatch):
+    """Pairs that were refused, as none that are left off are, were refitted again with each other cause in turn."""
+    search, tried, told = sys.modules["seaopt.estimation.judgement.hypothesis_search"], [], []
+    refit = search._refit
+
+    def refuse_pairs(change, old, fitted, *rest):
+        tried.append((*(each.effect for each in change.hypotheses), fitted.z.tobytes()))
+        return refit(change, old, fitted, *rest) if len(change.hypotheses) == 1 else None
+
+    monkeypatch.setattr(search, "_refit", refuse_pairs)
+    experiment, params = pose_joint(record_joint(harder=8.0, load=0.08, seconds=2.0), sticks=False)
+    so.fit([experiment], params, progress=lambda note, share=None: told.append(note))
+    pairs = [each for each in tried if len(each) == 3]
+    assert len(pairs) > 10
+    assert len(set(tried)) == len(tried)
+    causes = [note for note in told if ": " in note and note.startswith("trying cause")]
+    assert len(set(causes)) == len(causes) >= len(tried)
+    assert sum(", beside " in note for note in causes) == len(pairs)
+
+
 def test_a_search_that_may_not_go_on_returns_what_it_has():
     experiment, params = pose_screw(lambda columns: columns)
     fit = so.fit([experiment], params, diagnostics=False)

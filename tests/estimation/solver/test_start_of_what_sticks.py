@@ -59,7 +59,7 @@ def test_friction_that_holds_the_joint_throughout_is_no_start_to_end_at():
         4, "theta_m", speed=0.0, quiet_s=0.4, friction=0.4, progress=lambda note, share=None: notes.append(note)
     )
     assert fit.status == "converged"
-    assert any("looking for a start, round 1" in note for note in notes)
+    assert any("looking for a start, round 1 of 2" in note for note in notes)
     for name, true in TRUTH.items():
         assert abs(fit.parameters[name].value - true) < 4.0 * fit.parameters[name].std + 2e-3 * true
 
