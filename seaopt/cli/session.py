@@ -439,7 +439,6 @@ class Session:
     def _sweep(self, tell: Progress) -> None:
         source, design = self.parameters(), self.problem.design_plant
         self.warn_of_design([design, *(plant for plant, _ in self.problem.robust_to(source).values())])
-        self._spec()
         options: dict[str, Any] = {"free_law": self.free_law, "executor": self.executor, "progress": tell}
         result, plans = sweep_problem(self.problem, source, self.bandwidths_hz, **options)
         content, self.results["sweep"] = result.to_dict(), result

@@ -120,9 +120,7 @@ def _average(u: Any, model: Any, error: Any, period: float, starts: Any, length:
     )
 
 
-def find_feedback(
-    u: Float[np.ndarray, " n"], error: Float[np.ndarray, "y n"], runs: Sequence[slice], alpha: float = FALSE_ALARM
-) -> bool:
+def find_feedback(u: Float[np.ndarray, " n"], error: Float[np.ndarray, "y n"], runs: Sequence[slice]) -> bool:
     """Tell whether the input answers the noise: whether what past input and errors do not predict of an error is
     correlated with what the past of input soon after does not predict of it.
 
@@ -152,7 +150,7 @@ def find_feedback(
             powers[:, lag - 1] += np.sum(np.maximum(product**2, (noises[:, :-lag] * floor) ** 2), axis=1)
     each = sums**2 / np.maximum(powers, 1e-300)
     beside = np.maximum(np.mean(each[:, LAGS:], axis=1), 1.0)
-    return bool(np.any(np.max(each[:, :AHEAD], axis=1) > beside * chdtri(1, alpha / (AHEAD * outputs))))
+    return bool(np.any(np.max(each[:, :AHEAD], axis=1) > beside * chdtri(1, FALSE_ALARM / (AHEAD * outputs))))
 
 
 def _leave(regressors: Any, target: Any) -> Any:

@@ -36,12 +36,8 @@ class StrictTable(BaseModel):
 
 
 @cache
-def table_of(
-    record: type[Any], name: str = "", leave_out: Collection[str] = (), base: type[StrictTable] = StrictTable
-) -> Any:
-    """Return a record's table, a key per stated option with type, range, default and text; `name`: else its own;
-    `base`: a table with the keys that come before.
-    """
+def table_of(record: type[Any], leave_out: Collection[str] = (), base: type[StrictTable] = StrictTable) -> Any:
+    """Return a record's table, a key per stated option with type, range, default and text, behind those of `base`."""
     keys: dict[str, Any] = {}
     for field in list_options(record):
         if field.name in leave_out:
@@ -65,9 +61,8 @@ def table_of(
                 json_schema_extra=extra,
             ),
         )
-    title = name or f"{record.__name__}Table"
     text = (record.__doc__ or "").strip().splitlines()[0]
-    return create_model(title, __base__=base, __doc__=text, __module__=__name__, **keys)
+    return create_model(f"{record.__name__}Table", __base__=base, __doc__=text, __module__=__name__, **keys)
 
 
 def _as_written(kind: Any, option: Option) -> Any:

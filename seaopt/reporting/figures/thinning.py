@@ -36,6 +36,6 @@ def break_at(time: VectorN, values: VectorN, gaps: RowsK) -> tuple[VectorM, Vect
     return np.insert(time, gaps, middles), np.insert(values, gaps, np.nan)
 
 
-def describe_thinning(count: int, stretches: int = STRETCHES) -> str:
+def describe_thinning(count: int) -> str:
     """Return how a series of so many samples is drawn, as a sentence for captions; empty where it is drawn whole."""
-    return "" if count <= 2 * stretches else f"Of {count} samples, {METHOD.format(stretches)} are drawn."
+    return "" if count <= 2 * STRETCHES else f"Of {count} samples, {METHOD.format(STRETCHES)} are drawn."
