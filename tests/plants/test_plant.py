@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -130,3 +132,11 @@ def test_a_result_is_computed_once_for_each_plant():
 def test_dead_times_are_those_of_the_parts():
     plant = so.plants.high_impedance()
     assert list_dead_times(wrapped(plant, ["load_cell", "command_delay"])) == ("T_c",)
+
+
+def test_an_error_has_its_plant_as_a_field():
+    with pytest.raises(PlantError) as raised:
+        build(f=lambda t, x, u, p: {"x": x.v})
+    error = pickle.loads(pickle.dumps(raised.value))
+    assert (error.plant, error.reason) == ("cart", 'f returns nothing for "v"; add its equation')
+    assert str(error) == f"plant cart: {error.reason}"
