@@ -156,11 +156,17 @@ def limit_notes(command: Command, spec: LoopSpec) -> tuple[str, ...]:
     """Say which quantity a limit holds where no current is commanded, and where the command's own range is narrower."""
     notes, requested = list[str](), spec.limit_asked
     key = "command_limit" if spec.current_limit_A is None else "current_limit_A"
-    if spec.current_limit_A is not None and command.unit != "A":
-        notes.append(
-            f"{key} = {requested:g} limits the command, {requested:g}{unit_after(command.unit)} of "
-            f"{command.input}, not the current itself; command_limit is the same under its own name"
-        )
+    in_amperes = {
+        "current_limit_A": ("command_limit", command.unit),
+        "current_slew_A_per_s": ("command_slew_per_s", divide_units(command.unit, "s")),  # of a plan alone
+    }
+    for name, (other, unit) in in_amperes.items():
+        value: float | None = getattr(spec, name, None)
+        if value is not None and command.unit != "A":
+            notes.append(
+                f"{name} = {value:g} limits the command, {value:g}{unit_after(unit)} of {command.input}, not the "
+                f"current itself; {other} is the same under its own name"
+            )
     if command.largest is not None and (requested is None or requested > command.largest):
         reason = "no limit is given" if requested is None else f"{key} = {requested:g} is more than acts"
         reach = f"{command.largest:.4g}{unit_after(command.unit)}"

@@ -20,7 +20,7 @@ from seaopt.errors import ControlError, require_type
 from seaopt.options import check_options, list_options, option
 from seaopt.records import record
 
-NO_SLEW_LIMIT = 1e12  # A/s, far above which the plan's rows for it vanish in rounding
+NO_SLEW_LIMIT = 1e12  # A/s or another unit's, far above which the plan's rows for it vanish in rounding
 MAX_HORIZON_SAMPLES = 500  # of a horizon
 MAX_MPC_DELAY_SAMPLES = 100
 FILTER_DAMPING = 0.7  # of a prefilter that states none
@@ -62,7 +62,14 @@ class MPCSpec(LoopSpec):
     )
     command_limit: float | None = option("The same of another command, in its unit. Give one.", default=None, above=0.0)
     current_slew_A_per_s: float | None = option(
-        "Largest rate of the command, in its unit per second; no limit where left out.",
+        "Largest rate of the command, a current; no limit where left out.",
+        default=None,
+        unit="A/s",
+        above=0.0,
+        most=NO_SLEW_LIMIT,
+    )
+    command_slew_per_s: float | None = option(
+        "The same of another command, in its unit per second. Give one of the two.",
         default=None,
         above=0.0,
         most=NO_SLEW_LIMIT,
@@ -139,6 +146,11 @@ class MPCSpec(LoopSpec):
                 f"current_limit_A = {self.current_limit_A}, command_limit = {self.command_limit}: give one of the two"
             )
         check_options(self, ControlError)
+        if self.current_slew_A_per_s is not None and self.command_slew_per_s is not None:
+            raise ControlError(
+                f"current_slew_A_per_s = {self.current_slew_A_per_s:g} and command_slew_per_s = "
+                f"{self.command_slew_per_s:g} are both given; give one"
+            )
         require_type(self.noise, (NoiseModel, NoneType), "noise", "give a NoiseModel", ControlError)
         if not 4.0 * self.bandwidth_hz < self.sample_rate_hz:
             raise ControlError(
@@ -199,7 +211,11 @@ class MPCSpec(LoopSpec):
         return round(self.horizon_s * self.sample_rate_hz)
 
     @property
+    def slew_asked(self) -> float | None:
+        """The limit of the command's rate, in its unit per second; None for none."""
+        return self.command_slew_per_s if self.current_slew_A_per_s is None else self.current_slew_A_per_s
+
+    @property
     def slew_per_sample(self) -> float:
-        """Largest change of current from one sample to the next; infinite without a limit."""
-        slew = self.current_slew_A_per_s
-        return np.inf if slew is None else slew * self.sample_time_s
+        """Largest change of the command from one sample to the next; infinite without a limit."""
+        return np.inf if self.slew_asked is None else self.slew_asked * self.sample_time_s

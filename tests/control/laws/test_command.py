@@ -66,6 +66,28 @@ def test_the_smaller_of_what_is_asked_and_the_range_limits_everything(limits, ho
     assert steps["50 % step"] == pytest.approx(0.5 * stall_torque(holds))
 
 
+def test_a_rate_of_a_duty_has_its_own_name_and_unit():
+    """Under the name in amperes it is the same plan, with a note that it is none; both are refused."""
+    spec = {"command_limit": 0.9, "measured": "tau_s", "bandwidth_hz": 10, "max_sensitivity": 2.0}
+    named, older, none = (
+        force_mpc(PLANT, VALUES, MPCSpec(**spec, **rate))
+        for rate in ({"command_slew_per_s": 20.0}, {"current_slew_A_per_s": 20.0}, {})
+    )
+    state, commands = named.start, [0.0]
+    for _ in range(20):
+        command, state = named.command(state, 0.5 * named.static_gain, 0.0)
+        commands.append(command)
+    assert np.max(np.abs(np.diff(commands))) == pytest.approx(20.0 * 1e-3, rel=1e-6)
+    assert named.command(named.start, 5.0, 0.0)[0] == older.command(older.start, 5.0, 0.0)[0]
+    assert none.command(none.start, 0.5 * none.static_gain, 0.0)[0] > 0.03
+    assert ", 20 1/s," in " ".join(repr(named).split())
+    assert not [note for note in named.notes if "slew" in note]
+    (note,) = (note for note in older.notes if "slew" in note)
+    assert "20 1/s of duty" in note and "command_slew_per_s is the same" in note
+    with pytest.raises(ControlError, match="current_slew_A_per_s = 5 and command_slew_per_s = 6 are both given; give"):
+        MPCSpec(**spec, current_slew_A_per_s=5.0, command_slew_per_s=6.0)
+
+
 def test_a_limit_of_amperes_stays_as_it_is_asked():
     stand = so.plants.high_impedance()
     spec = so.ControllerSpec(bandwidth_hz=30, current_limit_A=9.0)

@@ -24,7 +24,7 @@ def judge(mpc: ForceMPC, commands: Commands) -> Verdict:
 def describe(mpc: ForceMPC) -> list[Section]:
     """Return the limits of the plan, the loop's limits with what was achieved, and the findings."""
     spec, unit = mpc.spec, mpc.design[0].outputs[mpc.spec.measured]
-    slew, per_second = spec.current_slew_A_per_s, f"{unit_after(mpc.actuation.unit) or ' 1'}/s"
+    slew, per_second = spec.slew_asked, f"{unit_after(mpc.actuation.unit) or ' 1'}/s"
     limits = mpc.actuation.show(mpc.command_limit) + ("" if slew is None else f", {slew:g}{per_second}")
     bounds = [
         f"{name} within {low:g} and {high:g} {mpc.kalman.units[mpc.kalman.names.index(name)]}".rstrip()
