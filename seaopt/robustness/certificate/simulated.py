@@ -123,7 +123,7 @@ def measure_steps(context: CheckContext, progress: Progress) -> Evidence:
     shown = {name: name not in found["friction"] or found["friction"][name].shown for name in models}
     cycles: dict[str, tuple[FoundCycle, ...]] = {}
     for name, seen in zip(
-        shown, map_ordered(partial(_seek, context.shared), shown.items(), context.executor), strict=True
+        shown, map_ordered(partial(_seek, context.shared, context.plan), shown.items(), context.executor), strict=True
     ):
         if seen or not shown[name]:
             ends = list_step_cycles(steps, name) if isinstance(steps, Verification) else ()
@@ -181,10 +181,10 @@ SIMULATIONS = Check(
 )
 
 
-def _seek(shared: Shared[Cases], model: tuple[str, bool]) -> tuple[FoundCycle, ...]:
+def _seek(shared: Shared[Cases], plan: ForceMPC | None, model: tuple[str, bool]) -> tuple[FoundCycle, ...]:
     """Return the limit cycles of one model, whose friction is shown to be harmless or is not."""
     cases, (name, shown) = shared.value, model
-    return seek_limit_cycles(cases.controller, cases.models[name], cases.unknown.nominal, shown=shown)
+    return seek_limit_cycles(cases.controller, cases.models[name], cases.unknown.nominal, shown=shown, plan=plan)
 
 
 def select_simulated(models: Plants, at: tuple[str, float] | None) -> dict[str, Plant]:

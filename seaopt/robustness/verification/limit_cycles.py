@@ -2,6 +2,9 @@
 
 A cycle that the describing function predicts is started from: the plant in the predicted state, pushed beyond it, law
 and commands at rest, a reference of zero. What is left after many periods has found itself, whatever was predicted.
+
+Of predictive control the cycles are predicted of its linear region, and played with its own step: beyond the limits of
+the plan, which a cycle or the push may reach, it is no linear law.
 """
 
 from __future__ import annotations
@@ -11,17 +14,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from seaopt.control import Controller
+from seaopt.control import Controller, ForceMPC
 from seaopt.control.laws.friction import LimitCycle, predict_limit_cycles
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import at_rest, run_loop
-from seaopt.errors import SimulationError
+from seaopt.errors import ControlError, SimulationError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
 from seaopt.robustness.verification.judgement import NOMINAL
-from seaopt.robustness.verification.oscillation import find_oscillation
+from seaopt.robustness.verification.oscillation import STEADY, find_oscillation
 from seaopt.robustness.verification.play_cycles import predict_play_cycles
+from seaopt.robustness.verification.playback import run_plan
 from seaopt.robustness.verification.scenarios import build_loop
 from seaopt.robustness.verification.verification import Verification
 from seaopt.units import LINEAR
@@ -81,15 +85,16 @@ class FoundCycle:
 
 
 def seek_limit_cycles(
-    controller: Controller, plant: Plant, params: ParameterSet, *, shown: bool = False
+    controller: Controller, plant: Plant, params: ParameterSet, *, shown: bool = False, plan: ForceMPC | None = None
 ) -> tuple[FoundCycle, ...]:
     """Return the limit cycles that friction, unless stability is shown, and play may make, at rest at zero. They are
-    predicted and simulated; a prediction whose simulation fails stands alone, with the reason.
+    predicted and simulated; a prediction whose simulation fails stands alone, with the reason. `plan`: predictive
+    control, whose linear region the controller is.
     """
     predicted = () if shown else predict_limit_cycles(controller, plant, params)
     predicted += predict_play_cycles(controller, plant, params)
     unit = controller.command.reference_unit
-    return tuple(replace(_simulate(controller, plant, params, cycle), unit=unit) for cycle in predicted)
+    return tuple(replace(_simulate(controller, plant, params, cycle, plan), unit=unit) for cycle in predicted)
 
 
 def list_step_cycles(runs: Verification, plant: str) -> tuple[FoundCycle, ...]:
@@ -107,24 +112,32 @@ def list_step_cycles(runs: Verification, plant: str) -> tuple[FoundCycle, ...]:
     )
 
 
-def _simulate(controller: Controller, plant: Plant, params: ParameterSet, cycle: LimitCycle) -> FoundCycle:
+def _simulate(
+    controller: Controller, plant: Plant, params: ParameterSet, cycle: LimitCycle, plan: ForceMPC | None
+) -> FoundCycle:
     """Return what a run that starts beyond a predicted cycle ends in."""
     period = controller.sample_time_s
     lasting = min(max(PERIODS / cycle.frequency_hz, LEAST_S), LONGEST_S)
     values = plant.complete(controller.delay(params)).drop_conditions()
+    begin, still = PUSH * np.array(cycle.state), np.zeros(math.ceil(lasting / period))
     try:
         # A gate that gives its sensor up ends a cycle, which would pass for one that does not last.
-        loop = build_loop(controller, plant, [values], runnable(controller, gate=False, outer=True))
-        start = at_rest(loop, 1, PUSH * np.array(cycle.state))
-        run = run_loop(loop, [values], np.zeros(math.ceil(lasting / period)), start=start)
+        if plan is not None:
+            force = run_plan(replace(plan, gate=None), plant, values, still, [], start_state=begin).force
+        else:
+            loop = build_loop(controller, plant, [values], runnable(controller, gate=False, outer=True))
+            run = run_loop(loop, [values], still, start=at_rest(loop, 1, begin))
+            force = run.outputs[controller.spec.regulated][0]
     except SimulationError as error:
         return FoundCycle(predicted=cycle, not_simulated=str(error))
-    force = run.outputs[controller.spec.regulated][0]
+    except ControlError:  # a plan's loop that runs away is refused
+        return FoundCycle(predicted=cycle, runs_away=True)
     if not np.all(np.isfinite(force)):
         return FoundCycle(predicted=cycle, runs_away=True)
     end = force[-int(JUDGED * force.size) :]
     line = find_oscillation(end, period, floor=FLOOR * cycle.force_N, lowest_hz=0.3 * cycle.frequency_hz)
     if line is None or not line.sustained:
-        return FoundCycle(predicted=cycle, runs_away=line is not None and line.growing)
+        first, last = (float(np.max(np.abs(half))) for half in np.array_split(end, 2))
+        return FoundCycle(predicted=cycle, runs_away=last > max(STEADY * first, cycle.force_N))  # also if it is no line
     simulated = SimulatedCycle(force_N=line.amplitude, frequency_hz=line.frequency_hz)
     return FoundCycle(predicted=cycle, simulated=simulated)

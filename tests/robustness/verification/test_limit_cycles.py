@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.laws.friction import describe_friction, predict_limit_cycles
 from seaopt.control.laws.plausibility import PlausibilityGate
 from seaopt.errors import SimulationError
 from seaopt.plants.friction import friction_states
 from seaopt.plants.roles import Friction
+from seaopt.robustness import linear_controller
 from seaopt.robustness.verification.limit_cycles import seek_limit_cycles
 from seaopt.robustness.verification.play_cycles import predict_play_cycles
 from tests import laws
@@ -127,6 +129,65 @@ def test_an_unstable_cycle_bounds_what_friction_holds(blind, stand, rubbing):
     assert np.argmax(spectrum) / 4.096 == pytest.approx(cycle.frequency_hz, rel=0.05)
     (found,) = seek_limit_cycles(wild, stand, rubbing)
     assert found.runs_away
+
+
+@pytest.fixture(scope="module")
+def planned(stand, rubbing):
+    """Return a plan, and a stiffer and lighter actuator on which its loop grows sliding."""
+    free = {"max_sensitivity": False, "max_complementary": False}
+    spec = MPCSpec(current_limit_A=4.0, bandwidth_hz=30.0, compute_delay_samples=2, **free)
+    return force_mpc(stand, rubbing, spec), rubbing.update(J=6e-6, k=240e3)
+
+
+def play_by_hand(mpc, params, push, n, substeps=20):
+    """Return the force of the plan's own steps on the mass with smoothed friction, by Runge and Kutta, from a state."""
+    p = {name: params[name].value for name in params}
+    mass, r, x = Mass.of(p), p["l"] / (2 * np.pi * p["N_p"]), np.array(push)
+    state, commands, force, h = mpc.start, [], np.zeros(n), mpc.sample_time_s / substeps
+
+    def rates(x, effort):
+        friction = mass.b * x[1] + mass.f_c * np.tanh(x[1] / mass.v_s)
+        return np.array([x[1], (effort - friction - mass.k * x[0]) / mass.m])
+
+    for k in range(n):
+        force[k] = mass.k * x[0]
+        command, state = mpc.command(state, 0.0, force[k])
+        commands.append(command)
+        effort = p["eta"] * p["K_tau"] / r * (commands[k - 2] if k >= 2 else 0.0)
+        for _ in range(substeps):
+            first = rates(x, effort)
+            second = rates(x + 0.5 * h * first, effort)
+            third = rates(x + 0.5 * h * second, effort)
+            x = x + h / 6.0 * (first + 2.0 * second + 2.0 * third + rates(x + h * third, effort))
+    return force
+
+
+def test_of_predictive_control_its_own_step_is_played(planned, stand):
+    """The law of the linear region grows without end there, and was said to die out; the plan's limits make a cycle."""
+    mpc, params = planned
+    linear = linear_controller(mpc)
+    (cycle,) = predict_limit_cycles(linear, stand, params)
+    assert not cycle.stable
+    (grown,) = seek_limit_cycles(linear, stand, params)
+    assert grown.runs_away and grown.lasts
+    (found,) = seek_limit_cycles(linear, stand, params, plan=mpc)
+    end = play_by_hand(mpc, params, 1.5 * np.array(cycle.state), 1000)[-400:]
+    spectrum = np.abs(np.fft.rfft(end * np.hanning(400), 16384)) / 100.0
+    top = int(np.argmax(spectrum))
+    assert found.lasts and not found.runs_away
+    assert found.simulated.frequency_hz == pytest.approx(top / 16.384, rel=0.01)
+    assert found.simulated.force_N == pytest.approx(spectrum[top], rel=0.03)
+    below = play_by_hand(mpc, params, 0.5 * np.array(cycle.state), 1000)  # as the unstable cycle says
+    assert np.max(np.abs(below[-100:])) < 0.05 * cycle.force_N
+
+
+def test_the_certificate_of_predictive_control_has_the_plans_cycle(planned, stand):
+    mpc, params = planned
+    certificate = so.certify(mpc, {"stiff": stand}, params, samples=1, runs=1)
+    (cycle,) = (each for each in certificate.cycles["stiff"] if each.predicted is not None)
+    (found,) = seek_limit_cycles(linear_controller(mpc), stand, params, plan=mpc)
+    assert cycle.simulated == found.simulated
+    assert any(row.name == "limit_cycle" and not row.met for row in certificate.requirements)
 
 
 def test_of_bristles_no_cycle_is_predicted_that_does_not_bend_them(blind, rubbing):
