@@ -84,7 +84,6 @@ def test_the_certificate_without_is_as_it_was(linear):
     assert (linear.to_dict()["simulation"], linear.to_dict()["passivity"]) == (None, None)
 
 
-@pytest.mark.slow
 def test_simulating_again_replaces(certificate, linear):
     again = certificate.with_simulation(seed=5)
     assert len(again.requirements) == len(certificate.requirements) == len(linear.requirements)
