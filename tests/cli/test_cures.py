@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -93,3 +94,20 @@ def test_each_plant_keeps_its_own_parts():
     assert held.copied == ('parts = ["current_loop", "spring_damping"]',) and "[plant.held]" in held.text
     assert swing.copied == ('parts = ["cogging", "spring_damping"]',) and "[plant.swing]" in swing.text
     assert values.copied == ("c_k = { value = 600, free = true }",)
+
+
+def test_a_cure_keeps_the_bounds_that_a_parameter_has():
+    """The line takes the place of the parameter's own, with which its bound would go: the next fit went beyond it."""
+    plant = so.plants.rotary(link="locked")
+    params = plant.complete(so.ParameterSet())
+    bounded = replace(params["eta"], value=0.8, max=1.0)
+    cause = FitFinding(
+        severity="error", kind="cause", where="tau_s", text="", preferred={"eta": (0.9, 0.01), "J_m": (2e-4, 1e-6)},
+        together=("eta", "J_m"),
+    )  # fmt: skip
+    fit = SimpleNamespace(
+        findings=(cause,), hypotheses=(), parameters=params.with_parameters(bounded),
+        experiments=(SimpleNamespace(plant=plant),),
+    )  # fmt: skip
+    (advice,) = _list_cures(fit, {"held": ()})
+    assert advice.copied == ("eta = { value = 0.9, free = true, max = 1 }", "J_m = { value = 0.0002, free = true }")

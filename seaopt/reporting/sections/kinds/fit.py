@@ -256,7 +256,7 @@ def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[Step]
             added.update(dict.fromkeys(trials[name].parts))
             table, rows = PARAMETERS, spell_parameters(trials[name].frees, trials[name].fixed)
         else:
-            table, *rows = spell_cure(name, value) or [PARAMETERS]
+            table, *rows = spell_cure(name, value, _list_bounds(fit, name)) or [PARAMETERS]
         places.setdefault(table, {}).update(dict.fromkeys(rows))
     if not plants:
         recipes = [experiment.plant.recipe for experiment in fit.experiments[:1]]
@@ -275,13 +275,24 @@ def _write_under(table: str, rows: Iterable[str]) -> Step:
     return Step(text=f"write under {table}, in place of a line of that name if there is one:", copied=tuple(rows))
 
 
-def spell_cure(name: str, value: float) -> list[str]:
-    """Return the place in a problem file and the line there that frees what a log would have otherwise; nothing where
-    there is no such line.
+def _list_bounds(fit: Fit, name: str) -> dict[str, float]:
+    """Return the bounds of a parameter that are closer than those of its plant, which its new line would lose."""
+    plants = (experiment.plant.parameters for experiment in fit.experiments)
+    declared, stated = next((each[name] for each in plants if name in each), None), fit.parameters.get(name)
+    if not isinstance(declared, Parameter) or stated is None:
+        return {}
+    closer = {"min": stated.min > declared.min, "max": stated.max < declared.max}
+    return {end: getattr(stated, end) for end, is_closer in closer.items() if is_closer}
+
+
+def spell_cure(name: str, value: float, bounds: Mapping[str, float] | None = None) -> list[str]:
+    """Return the place in a problem file and the line there that frees what a log would have otherwise, within the
+    bounds that it has; nothing where there is no such line.
     """
     *experiment, parameter = name.split(".")
     if not experiment:
-        return [PARAMETERS, f"{parameter} = {{ value = {value:.4g}, free = true }}"]
+        rows = {"value": f"{value:.4g}", "free": "true"} | {end: f"{at:.6g}" for end, at in (bounds or {}).items()}
+        return [PARAMETERS, f"{parameter} = {{ {', '.join(f'{key} = {each}' for key, each in rows.items())} }}"]
     if parameter == "delay_s" and value > 0.0:
         settings = f"value = {value:.4g}, free = true, max = {DELAY_ROOM * value:.2g}"
         return [f"[[experiment]] {experiment[0]}, beside its log", f"delay_s = {{ {settings} }}"]
