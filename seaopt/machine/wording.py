@@ -9,11 +9,12 @@ from seaopt.formatting import format_number, join_words
 from seaopt.machine.alternatives import Edited, EditedGain
 from seaopt.machine.causes import Cause
 from seaopt.machine.differences.certified import Untold
+from seaopt.machine.differences.drift import Drift
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.differences.size_search import find_end
 from seaopt.machine.gains.free_gains import SAME_GAINS
 from seaopt.machine.replay import Replay
-from seaopt.machine.response.judged import Bias, Judged
+from seaopt.machine.response.judged import Bias, Doubt, Judged
 from seaopt.machine.response.reach import CLOSEST, FEWEST_LINES, Band
 from seaopt.machine.response.reported import Reported
 from seaopt.machine.response.tripped import Trip
@@ -189,6 +190,41 @@ def say_certified_break(name: str, row: Judged, machines: str) -> str:
     if row.name == "bandwidth":
         return NONE_BELOW.format(name, machines, worst)
     return BREAKS.format(name, machines, limit, worst)
+
+
+def say_open(name: str, doubt: Doubt | None) -> str:
+    """Return an undecided figure with the lines at which it is."""
+    if doubt is None:
+        return name
+    return f"{name} ({_say_lines(doubt)})"
+
+
+def say_unsure(name: str, doubt: Doubt) -> str:
+    """Return why a figure whose interval may lie within its limit is undecided."""
+    return (
+        f"{name} is open {_say_lines(doubt)}, whatever its interval is: the command there is too near its own scatter "
+        "for a gain that is sure; a larger reference at that frequency, or the periods that are named, would make it so"
+    )
+
+
+def _say_lines(doubt: Doubt) -> str:
+    """Return the lines at which a figure is open."""
+    low, high = (format_number(edge, 3) for edge in (doubt.lines_hz[0], doubt.lines_hz[-1]))
+    return f"at {low} Hz" if len(doubt.lines_hz) == 1 else f"at {len(doubt.lines_hz)} lines from {low} to {high} Hz"
+
+
+def say_drift(drift: Drift, command: str) -> str:
+    """Return by how much a reading drifts beside what, and what would tell which of both it is. `command`: its name."""
+    size = f"{format_number(abs(drift.value), 3)}{unit_after(drift.unit)} in {format_number(drift.lasts_s, 3)} s"
+    said = f"{drift.name} drifts by {size} beside {drift.beside}"
+    if drift.beside != command:
+        return f"{said}, while the reference repeats: the zero of one of both sensors moves; tare, and record again"
+    if not drift.of_reading:
+        return f"{said}, but not beside another sensor: the drive or a load on the motor drifts, not the reading"
+    return (
+        f"{said}, while the reference repeats: the sensor's zero moves, and with it the true value, or else the drive "
+        "or a load on the motor does; an encoder of the deflection in the log would tell which; tare, and record again"
+    )
 
 
 def say_untold(untold: Untold) -> str:

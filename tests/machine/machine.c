@@ -27,6 +27,7 @@ typedef struct {
     double mass, damping, stiffness, per_ampere, coulomb, smoothing; /* M, b, k, kF, f_c, v_s */
     double mass2, stiffness2, damping2;                              /* zero mass2: no such part */
     double delay_s, late, law_gain, reading_sign, drive_sign, sensor_range, current_step, force_step, every, drive_limit;
+    double drive_drift; /* A/s, that the drive adds to what is commanded */
 } machine;
 
 static void rate(const machine *m, const double *x, double i, double *d)
@@ -81,6 +82,7 @@ void run(const machine *m, long n, long steps, double period, const double *refe
             double given = at >= 0 ? current[at] : 0.0;
             if (given > m->drive_limit) given = m->drive_limit;
             if (given < -m->drive_limit) given = -m->drive_limit;
+            given += m->drive_drift * t * period;
             advance(m, x, m->drive_sign * given, period / (double)steps);
         }
     }

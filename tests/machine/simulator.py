@@ -40,6 +40,7 @@ class Machine:
     force_step: float = 0.0
     every: float = 1.0
     drive_limit: float = 1e9  # behind the logged command
+    drive_drift: float = 0.0  # A/s, that it adds
 
     @classmethod
     def of_knee(cls, values) -> Machine:
@@ -90,15 +91,15 @@ class Bench:
         first = law.controllers[0] if isinstance(law, ScheduledController) else law
         return first.signals[0], first.command.reference_unit
 
-    def log(self, machine, reference, *, noise=2.0, seed=1, period=None, decimals=None, places=None):
+    def log(self, machine, reference, *, noise=2.0, seed=1, period=None, decimals=None, places=None, drift=0.0):
         """Return the log of a run: the law's clock is `period`, its sample time if left out; `places`: of a schedule,
-        its variable in each tick.
+        its variable in each tick; `drift`: of the sensor, per second.
         """
         law = self.controller
         period = period or (law.table if isinstance(law, ScheduledController) else law).sample_time_s
         n = reference.size
         reference = np.ascontiguousarray(reference, dtype=float)
-        errors = noise * np.random.default_rng(seed).normal(size=n)
+        errors = noise * np.random.default_rng(seed).normal(size=n) + drift * period * np.arange(n)
         place, force, current = np.zeros(n) if places is None else places.copy(), np.zeros(n), np.zeros(n)
         numbers = (ctypes.c_double * len(fields(machine)))(*(getattr(machine, f.name) for f in fields(machine)))
         pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (reference, errors, place, force, current)]

@@ -12,7 +12,8 @@ friction folds into the lines of each set, which the noise from period to period
 machine may be off by more than that. Nor does one many of whose periods had the command at its limit: what is left
 comes right after such a period, in which the loop was open.
 
-A sensor is at its range where readings pile up at an edge of what was read while the command moves on.
+A sensor is at its range where readings pile up at an edge of what was read while the command moves on. One that drifts
+is told by what else knows the force (`drift`): a machine whose reading may drift by more than the 2 % is none of those.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from jaxtyping import Float
 
 from seaopt.control import Controller
 from seaopt.machine.differences.comparison import TOLERATED, Comparison, Lines
+from seaopt.machine.differences.drift import Drift, find_drifts
 from seaopt.machine.differences.explanations import WORTH, explain
 from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
@@ -63,11 +65,17 @@ class Differences:
     # Why the log tells neither whether the machine is inside nor what differs: too few sets of phases for dry friction,
     # or too many periods in which the command is at its limit.
     untold: Untold = ""
+    drifts: tuple[Drift, ...] = ()  # of the reading that is regulated, beside what else knows the force
 
     @property
     def explained(self) -> bool:
         """Whether the first difference leaves no more than noise does, so that its interval holds."""
         return bool(self.found) and (self.found[0].left or 0.0) <= self.most_noise
+
+    @property
+    def read_wrongly(self) -> bool:
+        """Whether a sensor is what keeps the machine from being one of those: at its range, or drifting."""
+        return any(each.kind == "range" for each in self.found) or any(each.of_reading for each in self.drifts)
 
 
 def compare(
@@ -112,7 +120,8 @@ def compare(
     each_line = bool(np.all(share <= TOLERATED))
     together = each_line and is_one_of(comparison, spread, [model, *drawn], 1.0 - confidence)
     beyond = together and bool(found) and _is_beyond(comparison, values, found[0], model, reach)
-    inside = together and not flat and not beyond
+    drifts = find_drifts(controller, logs)
+    inside = together and not flat and not beyond and not any(each.of_reading for each in drifts)
     explained = bool(found) and found[0].explains >= EXPLAINED and (found[0].left or 0.0) <= WORTH
     untold = "" if inside or flat or explained else find_untold(controller, measured)
     worst = int(np.argmax(share))
@@ -128,6 +137,7 @@ def compare(
         nearest_misfit=None if best is None else misfits[best] / count,
         prediction=predict_response(controller, simulated) if dry else None,
         untold=untold,
+        drifts=drifts,
     )
 
 

@@ -17,6 +17,7 @@ from seaopt.machine.page.figures import list_panels
 from seaopt.machine.page.verdict import (
     OUTCOMES,
     judge,
+    list_drifts,
     list_left_out,
     name_figure,
     name_machines,
@@ -31,7 +32,7 @@ from seaopt.machine.response.measured_margins import MARGINS
 from seaopt.machine.response.periods import say_left_out
 from seaopt.machine.response.verdicts import LONGEST, SHORT_BY, Judged, Measured, Response, compares_amplitudes
 from seaopt.machine.ticks import AT_LIMIT, Gaps
-from seaopt.machine.wording import say_bias, say_cause, say_difference, say_status, say_trip, say_untold
+from seaopt.machine.wording import say_bias, say_cause, say_difference, say_status, say_trip, say_unsure, say_untold
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
@@ -218,6 +219,11 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     remarks += [_say_stuck(row, result.controller) for row in response.judged if row.state == "stuck"]
     remarks += [_say_as_played(row, result) for row in response.judged if row.state == "as played"]
     remarks += [_say_no_margin(row, response) for row in response.judged if row.name in MARGINS and not row.told]
+    remarks += [
+        f"{say_unsure(name_figure(row), row.doubt)}."
+        for row in response.judged
+        if row.doubt is not None and row.doubt.why == "command"
+    ]
     if response.still:
         unit = unit_after(result.controller.command.effort_unit)
         sizes = (f"{format_number(value, 3)}{unit}" for value in (response.effort, response.friction))
@@ -296,16 +302,17 @@ def _describe_differences(result: Acceptance, differences: Differences) -> Secti
     if differences.untold:
         untold = say_untold(differences.untold)
         sentences.append(f"{untold[0].upper()}{untold[1:]}.")
-    elif differences.each_line and not differences.inside and all(each.kind != "range" for each in differences.found):
+    elif differences.each_line and not differences.inside and not differences.read_wrongly:
         sentences.append(ONE_BY_ONE)
     if differences.nearest:
         nearest = ", ".join(f"{name} {format_number(value)}" for name, value in differences.nearest.items())
         whose = "certificate's draws" if result.certificate == "met" else "draws of the uncertainty that was given"
         sentences.append(f"The nearest of the {whose}: {nearest}.")
     tables = (Table(head=("difference", "95 % interval", "explains"), rows=rows, align="<>>"),) if rows else ()
+    items = tuple(Item(severity="warning", text=str(reason)) for reason in list_drifts(result, differences))
     return Section(
         title="Measured and model", part="differences", sentences=tuple(sentences), tables=tables,
-        remarks=_remark(differences),
+        remarks=_remark(differences), items=items,
     )  # fmt: skip
 
 

@@ -13,7 +13,9 @@ from seaopt.machine.wording import (
     say_cause,
     say_certified_break,
     say_difference,
+    say_drift,
     say_missing,
+    say_open,
     say_position_stays,
     say_status,
     say_trip,
@@ -77,8 +79,10 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     if differences is not None and not differences.inside:
         parts.append(say_inside(result, differences))
         first = response is not None and response.rate != 1.0  # by which all figures are other ones
-        said = say_untold(differences.untold) if differences.untold else _say_best(differences)
-        reasons.insert(0 if first else len(reasons), Reason(what=said))
+        reasons += list_drifts(result, differences)[:1]
+        if differences.found or not (differences.read_wrongly and differences.each_line):
+            said = say_untold(differences.untold) if differences.untold else _say_best(differences)
+            reasons.insert(0 if first else len(reasons), Reason(what=said))
     reasons += undecided  # what differs may be why
     if result.stepped is not None:
         reasons.append(Reason(what=say_difference(result.stepped)))
@@ -114,6 +118,13 @@ def say_inside(result: Acceptance, differences: Differences) -> str:
     if differences.inside:
         return f"the machine is {what}, to {100.0 * TOLERATED:.0f} % of its response"
     return f"the machine is not {what}"
+
+
+def list_drifts(result: Acceptance, differences: Differences) -> list[Reason]:
+    """Return the drifts of readings, those that may be the readings' own and the largest first."""
+    ranked = sorted(differences.drifts, key=lambda each: (not each.of_reading, -abs(each.value)))
+    command = result.controller.command.input
+    return [Reason(what=say_drift(each, command), where=each.log) for each in ranked]
 
 
 def _say_best(differences: Differences) -> str:
@@ -172,7 +183,8 @@ def say_undecided(result: Acceptance, response: Response) -> str:
         record.append(f"{periods} periods in all ({format_number(periods * response.period_s, 3)} s)")
     wanted = join_words(record) or ("again" if refuted else "more periods, or a larger reference")
     first = "mend what is refuted first, then " if refuted else ""
-    others = [f"{join_words([name_figure(row) for row in rows])}: {first}record {wanted}"] if rows else []
+    others = [f"{join_words([say_open(name_figure(row), row.doubt) for row in rows])}: {first}record {wanted}"]
+    others = others if rows else []
     return "; ".join([*others, *near, *broken])
 
 

@@ -16,6 +16,16 @@ Outcome = Literal["confirmed", "refuted", "undecided"]
 
 
 @record
+class Doubt:
+    """The lines at which a figure is open, and why."""
+
+    lines_hz: tuple[float, ...]
+    # disc: it reaches beyond the limit; command: it is too near its own scatter for the gain at the line to be sure,
+    # whatever that is
+    why: Literal["disc", "command"]
+
+
+@record
 class Judged:
     """A figure of the measured loop, and what the log says of its limit."""
 
@@ -40,6 +50,7 @@ class Judged:
     # the log does not decide; of stability, 0, where their 1 + L turns otherwise than that of a stable model, too; of
     # the bandwidth, where no line lies below.
     certified: float | None = None
+    doubt: Doubt | None = None  # where it is undecided for want of periods, or of a larger reference
 
     @property
     def told(self) -> bool:

@@ -204,6 +204,21 @@ def _find_stretches(reference: Float[np.ndarray, " n"], period: int) -> list[tup
     return stretches
 
 
+def _list_starts(reference: Float[np.ndarray, " n"], period: int) -> list[tuple[int, int]]:
+    """Return the first row of each period, but those of the transients, with the number of its stretch."""
+    stretches = enumerate(_find_stretches(reference, period))
+    return [(first + period * k, number) for number, (first, whole) in stretches for k in range(TRANSIENT, whole)]
+
+
+def list_periods(reference: Float[np.ndarray, " n"]) -> tuple[int, list[tuple[int, int]]]:
+    """Return the rows of a period of a reference that repeats, and where each begins that is judged, with the number of
+    its stretch.
+    """
+    period = find_period(reference)
+    assert period is not None
+    return period, _list_starts(reference, period)
+
+
 def shorten(ticks: Ticks) -> Ticks:
     """Return as many periods of each stretch of a log as its response takes without noise."""
     period = find_period(ticks.reference)
@@ -269,10 +284,7 @@ def cut_periods(
     if period is None:
         why = say_runaway(controller, ticks) or _say_aperiodic(len(ticks) * seconds, played)
         raise LogError(f"{ticks.source}: {why}")
-    stretches = _find_stretches(ticks.reference, period)
-    starts = [  # first row, stretch
-        (first + period * k, number) for number, (first, whole) in enumerate(stretches) for k in range(TRANSIENT, whole)
-    ]
+    starts = _list_starts(ticks.reference, period)
     at_limit = np.abs(ticks.command) >= AT_LIMIT * (controller.command_limit or np.inf)
     limited = [bool(np.any(at_limit[first : first + period])) for first, _ in starts]
     gated = [refused is not None and bool(np.any(refused[first : first + period])) for first, _ in starts]

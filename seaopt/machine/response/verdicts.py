@@ -43,7 +43,7 @@ from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import bound_disc
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.machine.response.discs import Ratio
-from seaopt.machine.response.judged import Judged, Measured, Outcome, Prediction
+from seaopt.machine.response.judged import Doubt, Judged, Measured, Outcome, Prediction
 from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import Blocks
 from seaopt.machine.response.reach import Band, find_missing, find_reach
@@ -314,7 +314,7 @@ def _compare_certified(row: Judged, prediction: Prediction) -> Judged:
         return row
     if row.outcome == "refuted" and row.low is not None and row.low > (1.0 + GRACE) * worst:
         return row
-    return replace(row, outcome="undecided", periods=None, certified=worst)
+    return replace(_leave_open(row), certified=worst)
 
 
 def _measure_bandwidth(controller: Controller, measured: Sequence[Measured]) -> float:
@@ -324,7 +324,7 @@ def _measure_bandwidth(controller: Controller, measured: Sequence[Measured]) -> 
 
 
 def _leave_open(row: Judged) -> Judged:
-    return replace(row, outcome="undecided", periods=None)
+    return replace(row, outcome="undecided", periods=None, doubt=None)
 
 
 def _tell_near(row: Judged, period_s: float) -> Judged:
@@ -352,12 +352,13 @@ def compares_amplitudes(measured: Sequence[Measured]) -> bool:
 def _judge_stability(controller: Controller, measured: Sequence[Measured], alpha: float) -> Judged:
     """Judge whether the loop is stable: no disc about 1 + L has zero in it, and 1 + L turns as that of the model."""
     lines = sum(part.f.size for part in measured)
-    room, where = math.inf, None
+    room, where, open_ = math.inf, None, list[float]()
     turned, known = _compare_turns(controller, measured)
     for part in measured:
         centre, radius = part.loop.disc(alpha / lines)
         ratio = np.abs(1.0 + centre) / np.maximum(radius, 1e-300)
         at = int(np.argmin(ratio))
+        open_ += part.f[ratio <= 1.0].tolist()
         if ratio[at] < room:
             room, where = float(ratio[at]), float(part.f[at])
     outcome: Outcome = (
@@ -367,7 +368,7 @@ def _judge_stability(controller: Controller, measured: Sequence[Measured], alpha
     needed = math.ceil(count / room**2) if outcome == "undecided" and 0.0 < room <= 1.0 else None
     return Judged(
         name="stability", limit=1.0, sense="at least", value=room, low=None, high=None, unit="-", outcome=outcome,
-        where_hz=where, periods=needed,
+        where_hz=where, periods=needed, doubt=_find_doubt(outcome, open_),
     )  # fmt: skip
 
 
@@ -406,6 +407,7 @@ def _judge_sensitivity(asked: float | None, measured: Sequence[Measured], alpha:
     low = high = value = 0.0
     where, needed = None, 0.0
     confirmed, refuted, least = True, False, math.inf
+    near, unsure = list[float](), list[float]()
     for part in measured:
         distance = np.abs(part.distance)
         wide, narrow = part.loop.disc(alpha / m), part.loop.disc(alpha)
@@ -418,6 +420,8 @@ def _judge_sensitivity(asked: float | None, measured: Sequence[Measured], alpha:
         x = part.loop.radial(alpha)
         slack = distance - x - 0.5 * limit * x**2 - 1.0 / limit
         confirmed = confirmed and bool(np.all(slack >= 0.0) and np.all(part.loop.sure))
+        near += part.f[slack < 0.0].tolist()
+        unsure += part.f[~part.loop.sure].tolist()
         refuted = refuted or bool(np.any(lower > limit))
         surety = part.loop.surety
         ranked = np.where(surety < 1.0, np.minimum(slack, surety - 1.0), slack)  # what is not sure decides, too
@@ -432,8 +436,18 @@ def _judge_sensitivity(asked: float | None, measured: Sequence[Measured], alpha:
     outcome = _decide(confirmed, refuted) if limit is not None else "undecided"
     return Judged(
         name="Ms", limit=limit, sense="at most", value=value, low=low, high=high, unit="-", outcome=outcome,
-        where_hz=where, periods=_count_periods(outcome, needed),
+        where_hz=where, periods=_count_periods(outcome, needed), doubt=_find_doubt(outcome, near, unsure),
     )  # fmt: skip
+
+
+def _find_doubt(outcome: Outcome, near: Sequence[float], unsure: Sequence[float] = ()) -> Doubt | None:
+    """Return the lines at which a figure is open. `near`: whose disc reaches beyond the limit; `unsure`: where the
+    command is too near its scatter.
+    """
+    lines = near or unsure
+    if outcome != "undecided" or not lines:
+        return None
+    return Doubt(lines_hz=tuple(sorted({*lines})), why="disc" if near else "command")
 
 
 def _count_periods(outcome: Outcome, needed: float) -> int | None:
@@ -483,7 +497,7 @@ def _judge_discs(name: str, asked: float | None, measured: Sequence[Measured], a
     limit = None if asked is None else asked * (1.0 + GRACE)
     m = sum(part.f.size for part in measured)
     low = high = value = needed = 0.0
-    where: float | None = None
+    where, open_ = None, list[float]()
     for part in measured:
         lower, upper = bound(part, alpha / m)[0], bound(part, alpha)[1]
         middle = _find_middle(bound, part)
@@ -493,6 +507,7 @@ def _judge_discs(name: str, asked: float | None, measured: Sequence[Measured], a
             value, where = float(middle[at]), float(part.f[at])
         if limit is not None:
             over = upper > limit
+            open_ += part.f[over].tolist()
             room = np.abs(limit - middle[over])
             needed = max(
                 needed,
@@ -501,7 +516,7 @@ def _judge_discs(name: str, asked: float | None, measured: Sequence[Measured], a
     outcome = "undecided" if limit is None else _decide(high <= limit, low > limit)
     return Judged(
         name=name, limit=limit, sense="at most", value=value, low=low, high=high if math.isfinite(high) else None,
-        unit="-", outcome=outcome, where_hz=where,
+        unit="-", outcome=outcome, where_hz=where, doubt=_find_doubt(outcome, open_),
         periods=_count_periods(outcome, needed),
     )  # fmt: skip
 
@@ -517,7 +532,7 @@ def _judge_bandwidth(
     limit = (1.0 - SHORT_BY) * least
     tracked = controller.achieved.bandwidth_hz is not None and controller.achieved.bandwidth_hz < 1e6
     m, bound = sum(part.f.size for part in measured), _bound_tracking(controller)
-    values, lows, highs = list[float](), list[float](), list[float]()
+    values, lows, highs, doubted = list[float](), list[float](), list[float](), list[float]()
     confirmed, refuted, needed, where = any(np.any(part.f <= limit) for part in measured), False, 0.0, None
     for part in measured:
         below = part.f <= limit
@@ -531,6 +546,7 @@ def _judge_bandwidth(
         lows.append(_find_fall(part.f, lower))  # which errs at one line, where the fall is
         highs.append(_find_fall(part.f, upper))  # which errs at any line below it
         open_ = below & (lower < HALF_POWER)
+        doubted += part.f[open_].tolist()
         room = np.maximum(np.abs(middle - HALF_POWER), 1e-300)
         needed = max(needed, float(np.max(((middle - lower) / room)[open_], initial=0.0)) ** 2 * part.periods)
     outcome = _decide(confirmed, refuted) if certified is None else "undecided"
@@ -540,6 +556,7 @@ def _judge_bandwidth(
         limit=limit if tracked else None, sense="at least", value=min(values), low=min(lows),
         high=high if math.isfinite(high) else None, unit="Hz", outcome=outcome, where_hz=where,
         periods=_count_periods(outcome, needed if certified is None else 0.0),
+        doubt=_find_doubt(outcome, doubted) if certified is None and tracked else None,
         predicted=predicted if tracked else None,
     )  # fmt: skip
 

@@ -1,0 +1,111 @@
+"""A sensor that drifts while the law holds its reading to the reference is noticed, by what else knows the force."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import seaopt as so
+from seaopt.files import to_json
+from seaopt.machine.acceptance import Acceptance
+from seaopt.machine.differences.drift import find_drifts
+from seaopt.machine.page.page import write_acceptance_page
+from seaopt.machine.ticks import take_ticks
+from tests.machine.conftest import FRICTION, make_dry
+from tests.machine.simulator import Machine, multisine
+from tests.machine.test_response import LINES
+
+PERIOD, LASTS = 1000, 11.0  # s, of the periods that are judged
+REFERENCE = multisine(PERIOD, LINES, 12, 60.0, 3, bias=300.0)
+RIGHT = Machine()
+
+
+def find(controller, log):
+    return find_drifts(controller, [take_ticks(controller, log)])
+
+
+def with_encoder(log, force, stiffness=RIGHT.stiffness):
+    """Return a log with the nut's place, in steps of a tenth of a micrometre, by the true force."""
+    signals = {name: log[name] for name in ("reference", "I", "F1")}
+    return so.Log.from_arrays(
+        time=log.time, q=np.round(force / stiffness, 7), units={"q": "m"}, source="bench", **signals
+    )
+
+
+def test_a_reading_that_drifts_is_refused_with_its_size(controller, bench, tmp_path):
+    """It was met: the reading follows its reference, and the lines of each period are those of a right machine."""
+    log = bench.log(RIGHT, REFERENCE, noise=0.2, drift=1.0)
+    result = so.accept(controller, [log])
+    (drift,) = result.differences.drifts
+    assert (drift.name, drift.beside, drift.unit, drift.lasts_s, drift.of_reading) == ("F1", "I", "N", LASTS, True)
+    assert drift.low < 1.0 * LASTS < drift.high and drift.high - drift.low < 1.0, drift
+    assert result.replayed and result.response.met and result.differences.each_line, result
+    assert not result.met and not result.differences.inside and not result.differences.found
+    said = " ".join(repr(result).split())
+    words = r"F1 drifts by 1[01](\.\d)? N in 11 s beside I"
+    assert re.search(words, said) and "its response is another one" not in said, said
+    content = json.loads(to_json(result.to_dict()))
+    assert Acceptance.from_dict(content, controller).differences.drifts == (drift,)
+    assert re.search(words, " ".join(write_acceptance_page(result, tmp_path / "page.html").read_text().split()))
+
+
+@pytest.mark.parametrize("drift", [2.0, -1.5])
+def test_an_encoder_tells_the_drift_of_a_sensor(controller, bench, drift):
+    log = bench.log(RIGHT, REFERENCE, drift=drift)
+    found = find(controller, with_encoder(log, log["F1"] - drift * log.time))
+    assert [each.beside for each in found] == ["q", "I"] and all(each.of_reading for each in found)
+    assert all(each.low < drift * LASTS < each.high for each in found), found
+
+
+def test_a_drive_that_drifts_leaves_a_reading_that_an_encoder_goes_with(controller, bench):
+    """Without the encoder nothing tells which of both it is."""
+    machine = replace(RIGHT, drive_drift=0.01)
+    log = bench.log(machine, REFERENCE)
+    (alone,), (beside,) = find(controller, log), find(controller, with_encoder(log, log["F1"]))
+    truth = 0.01 * machine.per_ampere * LASTS
+    assert (alone.beside, alone.of_reading) == ("I", True) and (beside.beside, beside.of_reading) == ("I", False)
+    assert all(each.low < truth < each.high for each in (alone, beside)), (alone, truth)
+
+
+def test_a_drift_is_told_beside_dry_friction(compiler, tmp_path):
+    """Whose mean over a period is another one in each set of phases, by more than the sensor drifts."""
+    bench, reference = make_dry(compiler, tmp_path, periods=4)
+    machine = replace(RIGHT, coulomb=FRICTION, smoothing=5e-3)
+    for drift in (0.0, 0.5):
+        log = bench.log(machine, reference, noise=0.5, drift=drift)
+        found = find(bench.controller, log)
+        assert len(found) == (drift > 0.0), found
+        assert all(each.low < drift * each.lasts_s < each.high for each in found), found
+
+
+@pytest.mark.parametrize("dry", [False, True])
+def test_no_drift_is_seen_where_there_is_none(compiler, tmp_path, controller, bench, dry):
+    """Of machines of another efficiency, friction, spring and noise, 40 of each kind."""
+    rng = np.random.default_rng(11)
+    if dry:
+        bench, reference = make_dry(compiler, tmp_path, periods=4)
+    for seed in range(40):
+        if not dry:
+            reference = multisine(PERIOD, LINES, 8, rng.uniform(20.0, 80.0), seed, bias=rng.uniform(-300.0, 300.0))
+        eta, damping, stiffness = rng.uniform(0.8, 1.2, 3)
+        machine = replace(
+            RIGHT, per_ampere=eta * RIGHT.per_ampere, damping=damping * RIGHT.damping,
+            stiffness=stiffness * RIGHT.stiffness, coulomb=FRICTION * rng.uniform(0.5, 1.5) * dry, smoothing=5e-3,
+        )  # fmt: skip
+        log = bench.log(machine, reference, noise=rng.uniform(0.1, 4.0), seed=seed)
+        assert not find(bench.controller, with_encoder(log, log["F1"], machine.stiffness)), (seed, machine)
+
+
+def test_an_interval_holds_the_drift(controller, bench):
+    """Of 60 logs, at 1 - 1e-4 each. What the ends of a period add to its mean goes to and fro, so that it is wider."""
+    off = []
+    for seed in range(60):
+        (drift,) = find(controller, bench.log(RIGHT, REFERENCE, drift=3.0, seed=seed))
+        assert drift.low < 3.0 * LASTS < drift.high, drift
+        off.append((drift.value - 3.0 * LASTS) / (drift.high - drift.low))
+    # of Student's t of 9 degrees of freedom the std is 1.13, and 1 - 1e-4 within 6.59 to each side
+    assert 0.3 < np.std(off) / (1.13 / (2.0 * 6.594)) < 1.2, np.std(off)
