@@ -256,6 +256,20 @@ class Controller(ClosesLoops, Result, Worded):
         return Gains.from_names(self.gains, self.observer, self.speed_loop, self.link)
 
     @property
+    def observer_share(self) -> float | None:
+        """The most that its observer takes off abs(S) of the design plant, up to a tenth of the bandwidth; or None."""
+        gains, model = self.read_gains(), self.with_model.design
+        if gains is None or gains.observer is None or model is None:
+            return None
+        return gains.weigh_observer(self.close(*model), self.spec.bandwidth_hz)
+
+    @property
+    def observer_notes(self) -> tuple[str, ...]:
+        """What is said of an observer that does next to nothing."""
+        share = self.observer_share
+        return () if self.observer is None or share is None else self.observer.warn(share, self.spec.bandwidth_hz)
+
+    @property
     def bandwidth_without_prefilter_hz(self) -> float | None:
         """The bandwidth that the same loop has on the design plant where its reference is not filtered.
 
@@ -330,7 +344,7 @@ class Controller(ClosesLoops, Result, Worded):
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
-        always = (*self.spec.lifted_notes, *map(str, self.measured))
+        always = (*self.spec.lifted_notes, *map(str, self.measured), *self.observer_notes)
         if self.design is None:
             return always
         plant, values = self.design

@@ -81,6 +81,7 @@ from seaopt.codec import to_content
 from seaopt.control.laws.assembly import Assembly, Columns
 from seaopt.control.loops.compensation.link_feedforward import LOWEST_HZ, LinkPath
 from seaopt.control.loops.law import Law
+from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
 from seaopt.options import option
@@ -104,7 +105,10 @@ INNER_GAINS = ("k_v", "k_ff")  # of a cascade besides; and T_v where its speed l
 SURPLUS_ROUNDING = 1e-12  # the reference's own gain at 0 Hz less 1/P(0) is zero below this share of its terms
 AGREES = 1e-6  # numbers for reading give the law's response to this share
 MADE_ROUNDING = 1e-10  # of a response's largest: left where a prefilter takes away next to all of it
+OBSERVED = 50  # frequencies at which an observer is weighed
+LEAST_OBSERVED = 0.02  # of a disturbance: an observer that takes less away is of no use
 COMPARED = np.geomspace(1e-4, 0.49, 60)  # frequencies at which it is compared, of the sample rate
+OBJECTIVE_HZ = 0.1  # disturbances count from here
 HALF_POWER_OF_Q = math.sqrt(math.sqrt(2.0) - 1.0)  # omega T_q where two equal lags are 3 dB down
 
 
@@ -230,6 +234,16 @@ class DisturbanceObserver:
     def bandwidth_hz(self) -> float:
         """Where Q_0, as two continuous lags, is 3 dB down."""
         return HALF_POWER_OF_Q / (2 * math.pi * self.T_q)
+
+    def warn(self, share: float, bandwidth_hz: float) -> tuple[str, ...]:
+        """Return that it does next to nothing, where it takes no more than a `share` off a disturbance."""
+        if share >= LEAST_OBSERVED:
+            return ()
+        return (
+            f"the disturbance observer does next to nothing: Q is 3 dB down at {self.bandwidth_hz:.3g} Hz, and from "
+            f"{OBJECTIVE_HZ:g} to {0.1 * bandwidth_hz:.3g} Hz it takes at most {100 * max(share, 0.0):.2g} % off what "
+            'the gains alone leave of a disturbance; structure = "pid" does as well',
+        )
 
     def filters(self, sample_time_s: float) -> tuple[TransferFunction, TransferFunction]:
         """Return Q and Q/P_n, multiplied out."""
@@ -379,6 +393,14 @@ class Gains:
         if self.inner is not None and self.inner.integrates:
             return self.k_i / (self.k_p + self.k_i * self.inner.T_v)
         return self.k_i / (1.0 + self.k_p)
+
+    def weigh_observer(self, loop: Loop, bandwidth_hz: float) -> float:
+        """Return the largest share that the observer takes off abs(S) of a loop, beside the same gains without it, from
+        where disturbances count to a tenth of the bandwidth: above that its phase costs more than it takes away.
+        """
+        f = np.geomspace(OBJECTIVE_HZ, max(0.1 * bandwidth_hz, OBJECTIVE_HZ), OBSERVED)
+        bare = replace(loop, law=replace(self, observer=None).law("pid", loop.law.sample_time_s))
+        return float(np.max(1.0 - np.abs(loop.sensitivity(f) / bare.sensitivity(f))))
 
     def by_name(self) -> dict[str, float]:
         """Return the numbers by name, those of observer, notch and prefilter too."""

@@ -50,6 +50,7 @@ from seaopt.control.laws.limits import BY_NAME, LIMITS, STEADY, STEADY_PERIODS, 
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import HIGHEST_CORNER, ControllerSpec
 from seaopt.control.laws.structures import (
+    OBJECTIVE_HZ,
     DisturbanceObserver,
     Gains,
     InnerLoop,
@@ -112,7 +113,6 @@ from seaopt.control.tuning.law_numbers import (
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.records import record
 
-OBJECTIVE_HZ = 0.1  # disturbances count from here
 NO_LIMIT, NO_FLOOR = 1e9, 1e-9
 NO_FLOOR_FILTERED = 1e-15  # below what a prefilter leaves next to the Nyquist frequency, where it has a zero
 NEARLY_KEPT = 1.001

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -35,6 +37,28 @@ def integrate_sensitivity(law, values, swings, slope):
     return np.trapezoid(np.abs(1.0 / (1.0 + loop)), np.log(f))
 
 
+def weigh(law, values):
+    """Return the most that the observer takes off abs(S) on the stand, from 0.1 Hz to a tenth of the bandwidth."""
+    p = values
+    rates = np.zeros((3, 3))
+    rates[0, 1], rates[1] = 1.0, np.array([-p["k_s"] / p["N"] ** 2, -p["b_r"], p["K_tau"] * p["eta"]]) / p["J_m"]
+    moved, f = expm(rates * TS), np.geomspace(0.1, 0.1 * BANDWIDTH, 50)
+    z, g = np.exp(2j * np.pi * f * TS), law.gains
+    force = np.array([p["k_s"] / p["N"] * np.linalg.solve(at * np.eye(2) - moved[:2, :2], moved[:2, 2])[0] for at in z])
+    plant = force / (p["N"] * p["K_tau"] * p["eta"]) / z
+    rate = (1.0 - 1.0 / z) / (g["T_f"] + TS - g["T_f"] / z)
+    bare = g["k_p"] + g["k_i"] * TS / 2 * (z + 1.0) / (z - 1.0) + g["k_d"] * rate
+    return np.max(1.0 - np.abs((1.0 + plant * bare) / (1.0 + plant * law.measurement.response(f, TS))))
+
+
+@pytest.fixture(scope="module")
+def law_with_observer():
+    stand = so.plants.rotary(link="locked")
+    params = stand.defaults.update(**{name: FIRST[name] for name in stand.parameters if name in FIRST} | {"f_c": 0.0})
+    spec = so.ControllerSpec(measured="tau_s", structure="pid_dob", bandwidth_hz=BANDWIDTH, max_noise_gain=35.0)
+    return so.tune(stand, params, spec), params
+
+
 def draw_values(seed):
     rng = np.random.default_rng(seed)
     scaled = {name: FIRST[name] * rng.uniform(0.8, 1.3) for name in ("K_tau", "J_m", "b_r", "k_s", "J_l", "d_l", "m")}
@@ -60,3 +84,21 @@ def test_it_is_never_worse_than_the_law_without(values):
         assert law.command.per_effort == pytest.approx(1.0 / (values["N"] * values["K_tau"] * values["eta"]))
         sizes[structure] = max(integrate_sensitivity(law, values, moves, k) for moves in (0, 1) for k in states)
     assert sizes["pid_dob"] < 1.001 * sizes["pid"]
+
+
+def test_an_observer_that_does_nothing_is_said_to(law_with_observer):
+    """What it takes off abs(S) at most up to a tenth of the bandwidth, of the plant and the gains written here."""
+    tuned, params = law_with_observer
+    gains, laws = tuned.read_gains(), []
+    for T_q in (0.05, 30.0):
+        made = replace(gains, observer=replace(gains.observer, T_q=T_q))
+        law = made.law("pid_dob", TS).balanced()
+        laws.append(replace(tuned, gains=made.by_name(), observer=made.observer, law=law))
+    quick, law = laws
+    assert not any("does next to nothing" in note for note in quick.notes)
+    assert quick.observer_share == pytest.approx(weigh(quick, FIRST), rel=1e-3) and quick.observer_share > 0.1
+    assert law.observer_share == pytest.approx(weigh(law, FIRST), abs=1e-7) and law.observer_share < 1e-3
+    (note,) = (note for note in law.notes if "does next to nothing" in note)
+    assert "takes at most 0 % off" in note and "3 dB down at 0.00341 Hz" in note
+    assert note in so.certify(law, {"stand": law.design[0]}, params, samples=1, simulations=False).notes
+    assert "takes at most 0 % off" in " ".join(repr(law).split())
