@@ -1,6 +1,7 @@
 """The scripts of benchmarks/ that judge: on numbers and records whose answer is given."""
 
 import importlib.util
+import itertools
 import sys
 from pathlib import Path
 
@@ -173,3 +174,30 @@ def test_the_silverbox_is_simulated_to_its_noise(tmp_path, monkeypatch):
     assert hold == "zero"
     assert {name: fit.parameters[name].value for name in SILVERBOX} == pytest.approx(SILVERBOX, rel=0.01)
     assert errors == pytest.approx(dict.fromkeys(("multisine", "arrow", "arrow_without_extrapolation"), 0.2), rel=0.3)
+
+
+def test_the_table_of_what_sticks_is_written_between_its_marks(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    bench, page = load_script("bench_sticking", monkeypatch), tmp_path / "page.md"
+    row = {"link": "locked", "seconds": 8.0, "seed": 3, "limit_s": 60.0, "cpu_s": None}
+    done = row | {"cpu_s": 0.391, "status": "converged", "met": True, "off": 4.6e-5}
+    kept = {"before": [row, done | {"seconds": 30.0, "met": False, "status": "max_iterations"}], "after": [done]}
+    page.write_text(f"above\n{bench.MARKS[0]}old\n{bench.MARKS[1]}below\n", encoding="utf-8")
+    bench.write_page(page, kept)
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert (lines[0], lines[-1]) == ("above", "below") and "old" not in lines
+    assert lines[2:6] == [
+        "| log | before | after |",
+        "|---|---|---|",
+        "| 8 s, link held | not done in 60 s | 0.39 s, met, 0.0046 % off |",
+        "| 30 s, link held | 0.39 s, max iterations, not met, 0.0046 % off | not measured |",
+    ]
+
+
+def test_a_limit_of_processor_time_ends_what_takes_longer(monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    bench = load_script("bench_sticking", monkeypatch)
+    with pytest.raises(TimeoutError), bench.limit_processor(0.05):
+        any(number < 0 for number in itertools.count())
+    with bench.limit_processor(0.05):
+        pass

@@ -44,6 +44,9 @@ def follow_parts(problem: FitProblem, start: Evaluation, callback: Callback | No
     unknowns, z = problem.unknowns, start.z
     quiet = [_count_quiet(experiment) for experiment in problem.experiments]
     longest = max(e.longest - before for e, before in zip(problem.experiments, quiet, strict=True))
+    cut = any(experiment.data.shots > 1 for experiment in problem.experiments)
+    if cut and SHORTEST * np.sqrt(2.0) >= longest:  # shots are begun anew before what is off adds up
+        return None
     size = np.full(z.size, np.inf)
     size[: unknowns.shared] = np.abs(unknowns.start[: unknowns.shared])
     prior_std = np.minimum(unknowns.prior_std, np.where(size > 0.0, size, np.inf))

@@ -1,6 +1,7 @@
 """Starts where joints stick: a knee with two encoders, simulated here step by step."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -129,3 +130,15 @@ def test_a_first_part_is_the_fit_of_a_log_that_ends_there():
     assert part.longest == 700
     np.testing.assert_allclose(rows[0].squares, rows[1].squares, rtol=1e-12)
     np.testing.assert_array_equal(rows[0].counts, rows[1].counts)
+
+
+def test_shots_that_are_shorter_than_a_part_are_not_followed_in_parts():
+    """They were searched roughly as a whole, and once more where that left more than noise."""
+    bench, known = pose(record(3, 2.0))
+    problem = pose_problem((replace(bench, shots=8),), known, loss=Squares())
+    start, before = problem.evaluate(problem.unknowns.start), count_evaluations()
+    assert growing.follow_parts(problem, start) is None
+    assert count_evaluations() == before
+    whole = pose_problem((bench,), known, loss=Squares())
+    growing.follow_parts(whole, whole.evaluate(whole.unknowns.start))
+    assert count_evaluations() > before + 2
