@@ -65,7 +65,30 @@ class LogError(SeaoptError):
 
 
 class SimulationError(SeaoptError):
-    """A simulation cannot be made, or left the numbers that can be trusted."""
+    """A simulation cannot be made, or left the numbers that can be trusted. `run`: of several, the one that did."""
+
+    def __init__(self, *args: object, run: int = 0) -> None:
+        super().__init__(*args)
+        self.run = run
+
+
+class UnplayedError(SimulationError):
+    """A scenario that cannot be simulated: which, on what plant, at which draw ("nominal", or its number from 1), and
+    its parameters where they differ from the nominal ones.
+    """
+
+    def __init__(
+        self,
+        *args: object,
+        plant: str = "",
+        scenario: str = "",
+        draw: str = "",
+        parameters: Mapping[str, float] | None = None,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(*args)
+        self.plant, self.scenario, self.draw, self.seed = plant, scenario, draw, seed
+        self.parameters = dict(parameters or {})
 
 
 class StepSizeError(SimulationError):

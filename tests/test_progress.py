@@ -13,6 +13,7 @@ from seaopt.logs import assess_quality
 from seaopt.problem.proposal import propose
 from seaopt.progress import divide
 from seaopt.robustness import Budget, tune_certified
+from seaopt.robustness.verification.large_signal import large_signal
 
 STAND, SWING, THOR = so.plants.high_impedance(), so.plants.moving_output(), so.plants.thor()
 SPEC = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0)
@@ -103,6 +104,13 @@ def test_a_tune_that_is_not_possible_tells_the_bandwidths_that_it_tries(heard):
     spec = so.ControllerSpec(structure="pd", bandwidth_hz=30, max_noise_gain=3, bandwidth_range_hz=(29, 31))
     assert not so.tune(STAND, THOR, spec, progress=heard).feasible
     heard.check("Hz instead", "refining start")
+
+
+def test_a_sweep_of_large_signals_tells_its_frequencies(heard):
+    law = so.tune(STAND, THOR, SPEC)
+    large_signal(law, STAND, THOR, amplitudes_N=(20.0,), frequencies_hz=(5.0, 20.0, 40.0), progress=heard)
+    assert [note for note in heard.notes if "Hz" in note] == heard.notes and len(heard.notes) == 3
+    assert heard.shares[0] == 0.0 < heard.shares[1] < heard.shares[2] < 1.0  # the slowest takes longest
 
 
 NO_MARGIN = so.ControllerSpec(measured="tau_s", bandwidth_hz=15, min_friction_margin=10.0)

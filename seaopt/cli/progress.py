@@ -29,6 +29,7 @@ SHOWN_AFTER_S = 2.0  # a stage that is done before shows no progress
 LEAST_SHARE = 0.02  # of a stage, from which what is left can be told
 # CAUTION: times what the measured speed makes of the remaining share; MOST: times what was spent, for which is told
 CAUTION, MOST = 2.5, 5.0
+WRONG = 2.0  # times what is left of what was told, from which another number is told
 RECENT, LEAST_RECENT_S = 0.25, 2.0  # of the time spent: the part whose speed counts by itself
 MOST_NOTE = 30  # characters beside the bar, in a terminal of 80
 REPORT_S = 30.0  # between lines of progress that go to a file
@@ -39,8 +40,8 @@ class TimeLeft:
 
     A stage may turn slow late: a fit that is done searching in a second looks for causes for half a minute. So what is
     measured is taken with caution, what is left takes at least as long as the longest part did, and where it is more
-    than was told before nothing is told: the number only falls. Nothing is told before the share `told_from`: what
-    comes before has no scale.
+    than was told before nothing is told, unless it is `WRONG` times as much or that time has passed: the number only
+    falls, but for one that was wrong. Nothing is told before the share `told_from`: what comes before has no scale.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, told_from: float = LEAST_SHARE) -> None:
@@ -66,7 +67,8 @@ class TimeLeft:
         slowness = max((last - started) / share, (last - since) / (share - before))
         silent = now - last  # what is silent for longer than was told takes longer
         end = now + CAUTION * max((1.0 - share) * slowness - silent, self._longest - silent, silent)
-        if end > self._end or end - now > MOST * (now - started):
+        wrong = end - now > WRONG * (self._end - now)  # what was told; also where it has passed
+        if (end > self._end and not wrong) or end - now > MOST * (now - started):
             return ""
         self._end = end
         left_s = end - now

@@ -230,6 +230,15 @@ def test_a_number_many_times_what_was_spent_is_not_told():
     assert follow([(60.0, 0.1)], [60.0]) == [""]
 
 
+def test_a_number_that_was_wrong_is_followed_by_another_one():
+    """A machine that is busy with others from there on: 3 minutes at most were told, and then nothing any more."""
+    moves = [(float(t), t / 100.0) for t in range(1, 41)] + [(40.0 + 25.0 * k, 0.4 + 0.01 * k) for k in range(1, 61)]
+    first, *others = follow(moves, [40.0, 540.0, 900.0])
+    assert first == "at most 3 min left"
+    for at, text in zip((540.0, 900.0), others, strict=True):
+        assert text.endswith("min left") and 60.0 * float(text.split()[2]) >= 40.0 + 25.0 * 60 - at, (at, text)
+
+
 def test_what_turns_slow_ends_before_what_was_told_or_nothing_is():
     """A fit that is searched in a second, and then tries thirty causes for a second each."""
     moves = [(0.1 * k, 0.06 * k) for k in range(1, 11)] + [(1.0 + k, 0.6 + 0.4 * k / 30) for k in range(1, 31)]

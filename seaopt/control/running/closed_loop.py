@@ -203,7 +203,8 @@ def run_loop(
         arrays = execute(job, substeps)
         wall_s += time.perf_counter() - begin
         kept = _first_lost_sample(arrays) == n
-        error = float(np.max(_errors(arrays, motion, unheld)[kept], initial=0.0)) / (1.0 if loop.sticks else 15.0)
+        errors = _errors(arrays, motion, unheld) / (1.0 if loop.sticks else 15.0)
+        error = float(np.max(errors[kept], initial=0.0))
         shortest = 2 * substeps > MAX_LOOP_SUBSTEPS
         decided = bool(np.all(kept)) or (
             before is not None and bool(np.all(kept | _lose_alike(before, arrays, shortest=shortest)))
@@ -212,21 +213,25 @@ def run_loop(
             return _result(loop, job, arrays, error, substeps, wall_s)
         if shortest:
             if decided:
+                worst, state = np.unravel_index(np.argmax(np.where(kept[:, None], errors, 0.0)), errors.shape)
                 raise StepSizeError(
-                    f"plant {loop.plant.name}: {2 * substeps} steps per sample leave an error of {error:.1e} of a "
-                    f"state (rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol"
+                    f"plant {loop.plant.name}: {2 * substeps} steps per sample leave an error of {error:.1e} of the "
+                    f"state {list(loop.plant.states)[state]} (rtol = {rtol:g}); check the parameters, smooth the "
+                    "friction (v_s), or raise rtol",
+                    run=int(worst),
                 )
             raise SimulationError(
                 f"plant {loop.plant.name}: {2 * substeps} steps per sample do not decide whether the loop runs away or "
-                "the steps are too long; check the parameters"
+                "the steps are too long; check the parameters",
+                run=int(np.argmin(kept)),
             )
         substeps, before = 2 * substeps, arrays
 
 
 def _errors(
     arrays: LoopArrays, motion: Float[np.ndarray, " nx"], unheld: Float[np.ndarray, "runs nx"]
-) -> Float[np.ndarray, " runs"]:
-    """Return the largest difference of two numbers of steps in a sample, over the state's largest value. A state that
+) -> Float[np.ndarray, "runs nx"]:
+    """Return the largest differences of two numbers of steps in a sample, over the state's largest value. A state that
     rests, or that friction holds, has rounding for a value: it is measured by the largest of the others, by `motion`,
     what an ampere would make of it in a sample without friction, and by `unheld`, what the first sample would without.
     """
@@ -234,7 +239,7 @@ def _errors(
     with np.errstate(invalid="ignore"):
         size = np.maximum(arrays.size, RESTS * np.maximum(free, np.max(arrays.size, axis=1, keepdims=True)))
         scale = np.where(size > 0.0, size, 1.0)
-        return np.nan_to_num(np.max(arrays.error / scale, axis=1), nan=np.inf)
+        return np.nan_to_num(arrays.error / scale, nan=np.inf)
 
 
 def _first_lost_sample(arrays: LoopArrays) -> Int[np.ndarray, " runs"]:

@@ -69,6 +69,8 @@ class Requirement(Result):
         What was simulated.
     draw : DrawnAt or None
         The parameters that decide.
+    cause : str or None
+        Of a run that fails, what it did that it may not: "growth", "outbreak", "gate", "not simulated", ...
     text, remedy : str
         What was found besides, and what to do about it.
     count : int
@@ -87,7 +89,8 @@ class Requirement(Result):
 
     json_keys = (
         "name", "limit", "value", "met", "sense", "tolerance", "unit", "plant", "state", Key(field="at", name="place"),
-        "scenario", "draw", "text", "remedy", "count", "scope", "risk", "where",
+        "scenario", "draw", Key(field="cause", name="cause", omit_none=True), "text", "remedy", "count", "scope",
+        "risk", "where",
     )  # fmt: skip
 
     name: str
@@ -102,6 +105,7 @@ class Requirement(Result):
     place: tuple[str, float] | None = None
     scenario: str = ""
     draw: DrawnAt | None = None
+    cause: str | None = None
     text: str = ""
     remedy: str = ""
     count: Annotated[int, Constraints(ge=1)] = 1

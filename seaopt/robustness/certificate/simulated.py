@@ -18,13 +18,13 @@ from seaopt.bench import Sensors
 from seaopt.codec import to_content
 from seaopt.control import Controller, ForceMPC
 from seaopt.control.laws.passivity import Passivity, passivity
-from seaopt.errors import ControlError, SeaoptError
+from seaopt.errors import ControlError, SeaoptError, UnplayedError
 from seaopt.executors import Shared, map_ordered
 from seaopt.formatting import format_count
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import has_friction, split_friction
-from seaopt.progress import Progress, divide, ignore
+from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import Result, Worded, record
 from seaopt.robustness.certificate.cases import Cases, Check, CheckContext, Evidence
 from seaopt.robustness.certificate.requirement import LIMIT_CYCLE, DrawnAt, Requirement, require_at_most
@@ -45,6 +45,7 @@ NOTHING_LARGE = (
     "large signals"  # of all plants, where no command is limited and nothing rubs: they look like small ones
 )
 STEP_OVERSHOOT, STEP_SETTLING = "step_overshoot", "step_settling_s"
+UNPLAYED = "not simulated"  # the cause where a scenario cannot be simulated
 # Kinds of fault that have a figure of their own are requirements by these names; all others are counted.
 NAMED_FAULTS = {
     "overshoot": STEP_OVERSHOOT, "settling": STEP_SETTLING, "steady error": "steady_error",
@@ -80,6 +81,7 @@ class Simulated(Result, Worded):
     command_step: float
     seed: int
     unchecked: tuple[str, ...] = ()
+    unplayed: SeaoptError | None = None  # why there is no verification; not read back from a file
 
     @property
     def met(self) -> bool:
@@ -106,7 +108,7 @@ def measure_steps(context: CheckContext, progress: Progress) -> Evidence:
     models = select_simulated(cases.models, context.place)
     devices = {} if context.simulations else context.devices  # else those scenarios, steps among them, have them
     try:
-        steps: Verification | str = verify(
+        steps: Verification | SeaoptError = verify(
             cases.controller,
             models,
             unknown.nominal,
@@ -119,7 +121,7 @@ def measure_steps(context: CheckContext, progress: Progress) -> Evidence:
             **devices,
         )
     except SeaoptError as error:
-        steps = str(error)
+        steps = error
     shown = {name: name not in found["friction"] or found["friction"][name].shown for name in models}
     cycles: dict[str, tuple[FoundCycle, ...]] = {}
     for name, seen in zip(
@@ -135,7 +137,8 @@ def measure_steps(context: CheckContext, progress: Progress) -> Evidence:
         if cycle.predicted is not None and cycle.lasts
     )
     rows = () if context.simulations else require_runs(steps)  # else those scenarios are judged
-    return Evidence(requirements=(*lasting, *rows), fields={"steps": steps, "cycles": cycles}, scope="simulated")
+    kept = steps if isinstance(steps, Verification) else str(steps)
+    return Evidence(requirements=(*lasting, *rows), fields={"steps": kept, "cycles": cycles}, scope="simulated")
 
 
 def _list_plan_steps(
@@ -254,24 +257,31 @@ def run_simulations(
     check_sensors(sensors, controller, plants)
     devices: dict[str, Any] = {"sensors": sensors or Sensors(), "command_step": command_step, "seed": seed}
     sweeps = _list_sweeps(controller, plants, parameters) if large_signals else {}
-    jobs = sweeps | _list_port_jobs(controller)
+    port = _list_port_jobs(controller)
+    jobs, parts = sweeps | port, [*[SWEEP] * len(sweeps), *[PORT / len(port)] * len(port)]
     sweeping, playing = divide(progress, SWEEP * len(sweeps) + PORT, SCENARIOS * len(plants))
-    attempts = map_ordered(_attempt, jobs.values(), executor)
-    done: dict[str, tuple[Any, str]] = {}
-    for number, what in enumerate(jobs):
-        sweeping(what, number / len(jobs))
-        done[what] = next(attempts)
+    # in this process a sweep tells how far it has come
+    apart = port if executor is None else jobs
+    attempts = map_ordered(_attempt, apart.values(), executor)
+    done: dict[str, tuple[Any, SeaoptError | None]] = {}
+    for what, tell in zip(jobs, divide(sweeping, *parts), strict=True):
+        tell(what, 0.0)
+        if executor is None and what in sweeps:
+            done[what] = _attempt(partial(jobs[what], progress=prefix(tell, what)))
+        else:
+            done[what] = next(attempts)
     play = partial(verify, controller, plants, parameters, draws=draws, known=steps, executor=executor, **devices)
     done["simulation"] = _attempt(partial(play, progress=playing))
-    left_out = {what: reason for what, (_, reason) in done.items() if reason}
+    left_out = {what: str(error) for what, (_, error) in done.items() if error is not None}
     applies = set(jobs) if controller.design[0].ports else set(sweeps)
     return Simulated(
         verification=done["simulation"][0],
-        large_signal=tuple(done[what][0] for what in sweeps if not done[what][1]),
+        large_signal=tuple(done[what][0] for what in sweeps if done[what][1] is None),
         passivity=done["passivity"][0],
         environments=done["environments"][0],
         left_out=left_out,
         unchecked=tuple(what for what in left_out if what in applies - {NOTHING_LARGE}),
+        unplayed=done["simulation"][1],
         **devices,
     )
 
@@ -287,28 +297,34 @@ def _list_port_jobs(controller: Controller) -> dict[str, Callable[[], Any]]:
     return {what: partial(measure, controller, *controller.design) for what, measure in verbs.items()}
 
 
-def _attempt(verb: Callable[[], Played]) -> tuple[Played | None, str]:
+def _attempt(verb: Callable[[], Played]) -> tuple[Played | None, SeaoptError | None]:
     """Return what a verb returns, or None and why it cannot be had."""
     try:
-        return verb(), ""
+        return verb(), None
     except SeaoptError as error:
-        return None, str(error)
+        return None, error
     except np.linalg.LinAlgError as error:
-        return None, f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
+        text = f"a matrix of it cannot be factorised ({error}); look at parameters that are zero or huge"
+        return None, SeaoptError(text)
 
 
 def require_simulated(simulated: Simulated) -> list[Requirement]:
     """Return what the scenarios require, or why there are none."""
-    runs = simulated.verification
-    return require_runs(simulated.left_out["simulation"] if runs is None else runs)
+    runs = simulated.unplayed if simulated.verification is None else simulated.verification
+    assert runs is not None
+    return require_runs(runs)
 
 
-def require_runs(runs: Verification | str) -> list[Requirement]:
+def require_runs(runs: Verification | SeaoptError) -> list[Requirement]:
     """Return what the runs require: the same fault in many runs of a plant is one requirement, with the worst of them.
-    A text says why nothing could be played.
+    An error says which of them could not be simulated.
     """
-    if isinstance(runs, str):
-        return [require_at_most(SIMULATION_FAILURES, np.inf, 0.0, text=runs)]
+    if isinstance(runs, SeaoptError):
+        spot: dict[str, Any] = {}
+        if isinstance(runs, UnplayedError):
+            draw = DrawnAt(parameters=runs.parameters, number=runs.draw, seed=runs.seed)
+            spot = {"plant": runs.plant, "scenario": runs.scenario, "draw": draw}
+        return [require_at_most(SIMULATION_FAILURES, np.inf, 0.0, text=str(runs), cause=UNPLAYED, **spot)]
     requirements: list[Requirement] = []
     for plant in runs.rigs:
         rows = [row for row in runs.rows if row.plant == plant]
@@ -334,7 +350,7 @@ def _list_failures(runs: Verification, rows: Sequence[Outcome]) -> list[Requirem
         name, value, limit, unit = SIMULATION_FAILURES, float(len(cases)), 0.0, ""
         if kind in NAMED_FAULTS:
             name, value, limit, unit = NAMED_FAULTS[kind], fault.value, fault.limit, fault.unit
-        words = {"text": fault.text, "remedy": fault.remedy, "count": len(cases), "unit": unit}
+        words = {"text": fault.text, "remedy": fault.remedy, "count": len(cases), "unit": unit, "cause": kind}
         requirements.append(replace(_require(runs, row, name, value, limit, **words), met=False))
     return requirements
 
@@ -375,5 +391,7 @@ def _list_sweeps(
     return {f"large signals on {name}": partial(_sweep, controller, name, *pair) for name, pair in on.items()}
 
 
-def _sweep(controller: Controller, name: str, plant: Plant, parameters: ParameterSet) -> LargeSignal:
-    return replace(large_signal(controller, plant, parameters), plant=name)
+def _sweep(
+    controller: Controller, name: str, plant: Plant, parameters: ParameterSet, progress: Progress = ignore
+) -> LargeSignal:
+    return replace(large_signal(controller, plant, parameters, progress=progress), plant=name)

@@ -284,9 +284,16 @@ def judge_run(
         plant=name,
         draw=NOMINAL if index == 0 else str(index),
         faults=tuple(judge.faults),
-        parameters={n: p.value for n, p in drawn.items() if n not in nominal or p.value != nominal[n].value},
+        parameters=find_differences(drawn, nominal),
         **judge.figures,
     )
+
+
+def find_differences(drawn: ParameterSet, nominal: ParameterSet) -> dict[str, float]:
+    """Return the values of a draw that differ from the nominal ones."""
+    return {
+        name: each.value for name, each in drawn.items() if name not in nominal or each.value != nominal[name].value
+    }
 
 
 def _judge_extremes(run: _TraceRun, judge: Judge) -> None:

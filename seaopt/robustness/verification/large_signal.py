@@ -29,6 +29,7 @@ from seaopt.errors import ControlError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import find_dry_friction, take_sliding
+from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Worded, record
 from seaopt.robustness.verification.amplitude_prediction import predict_gain
 from seaopt.robustness.verification.scenarios import build_loop
@@ -93,6 +94,7 @@ def large_signal(
     *,
     amplitudes_N: tuple[float, ...] | None = None,
     frequencies_hz: tuple[float, ...] | None = None,
+    progress: Progress = ignore,
 ) -> LargeSignal:
     """Sweep a controller over frequency and amplitude on a nonlinear plant, without noise.
 
@@ -107,6 +109,8 @@ def large_signal(
     frequencies_hz : tuple of float, optional
         From a fifth of the bandwidth to twice if left out, with friction from a fifteenth; each is moved to the nearest
         with whole periods in whole samples.
+    progress : callable, optional
+        Called before each frequency (`seaopt.progress.Progress`).
 
     Returns
     -------
@@ -159,8 +163,9 @@ def large_signal(
         raise ControlError(f"amplitudes_N = {amplitudes_N} are not positive; give some")
     gain = np.zeros((amplitude.size, f.size), dtype=complex)
     saturated = np.zeros(gain.shape, dtype=bool)
-    for column, (frequency, length) in enumerate(zip(f, lengths, strict=True)):
-        n = length + math.ceil(max(SETTLING_PERIODS / frequency, LEAST_SETTLING_S) / period)
+    samples = lengths + np.ceil(np.maximum(SETTLING_PERIODS / f, LEAST_SETTLING_S) / period).astype(int)
+    for column, (frequency, length, n) in enumerate(zip(f, lengths, samples, strict=True)):
+        progress(f"{frequency:.3g} Hz", float(np.sum(samples[:column]) / np.sum(samples)))
         phase = 2 * np.pi * frequency * period * np.arange(n)
         run = run_loop(loop, [parameters] * amplitude.size, amplitude[:, None] * np.sin(phase))
         force, current = run.outputs[loop.regulated][:, -length:], run.current[:, -length:]

@@ -13,7 +13,7 @@ from seaopt.bench import Sensors
 from seaopt.codec import Key, OrInfinite, read_fields, to_content
 from seaopt.control import Controller, ForceMPC
 from seaopt.control.laws.command import Command
-from seaopt.errors import ControlError, StepSizeError, suggestion
+from seaopt.errors import ControlError, SimulationError, StepSizeError, UnplayedError, suggestion
 from seaopt.executors import Shared, map_ordered
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -24,7 +24,13 @@ from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.uncertainty.draws import Plants
-from seaopt.robustness.verification.judgement import NOMINAL, Outcome, judge_run, overshoots_at_limit
+from seaopt.robustness.verification.judgement import (
+    NOMINAL,
+    Outcome,
+    find_differences,
+    judge_run,
+    overshoots_at_limit,
+)
 from seaopt.robustness.verification.playback import Playback, Rig, check_planned, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
 from seaopt.units import Mechanics
@@ -336,19 +342,28 @@ _Staged = tuple[dict[str, Rig], dict[str, tuple[ParameterSet, ...]], dict[str, s
 
 
 def _play_part(staged: Shared[_Staged], part: tuple[str, Scenario]) -> _Runs:
-    """Play a scenario on one rig; with friction that sticks, where its smoothed curve is too steep to simulate."""
+    """Play a scenario on one rig; with friction that sticks, where its smoothed curve is too steep to simulate. Raises
+    UnplayedError: neither can be simulated.
+    """
     rigs, sets, names, seed = staged.value
     name, scenario = part
     rig = rigs[name]
     try:
-        return _run_scenario(rig, name, scenario, sets[name], seed)
-    except StepSizeError:
-        actual = make_sticking(scenario)
-        if scenario.friction == "sticking" or actual.obstacle(rig.plant, rig.partner):
-            raise
-        if actual.name in names[name]:
-            return _Runs(actual=actual, outcomes=[])
-        return _run_scenario(rig, name, actual, sets[name], seed)
+        try:
+            return _run_scenario(rig, name, scenario, sets[name], seed)
+        except StepSizeError:
+            actual = make_sticking(scenario)
+            if scenario.friction == "sticking" or actual.obstacle(rig.plant, rig.partner):
+                raise
+            if actual.name in names[name]:
+                return _Runs(actual=actual, outcomes=[])
+            return _run_scenario(rig, name, actual, sets[name], seed)
+    except SimulationError as error:
+        draw = NOMINAL if error.run == 0 else str(error.run)
+        differs = find_differences(sets[name][error.run], sets[name][0])
+        raise UnplayedError(
+            *error.args, plant=name, scenario=scenario.name, draw=draw, parameters=differs, seed=seed
+        ) from error
 
 
 def _run_scenario(rig: Rig, name: str, scenario: Scenario, sets: Sequence[ParameterSet], seed: int) -> _Runs:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.codec import to_content
 from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.running import closed_loop
 from seaopt.errors import ControlError, FileError
@@ -125,6 +126,8 @@ def test_a_run_that_fails_is_a_requirement_with_its_witness(controller, stand, t
     (failed,) = [item for item in found.requirements if item.name == "simulation_failures"]
     assert (failed.met, failed.value, failed.limit) == (False, 7.0, 0.0)  # the same failure in every run, once
     assert failed.plant == "stand" and "draw nominal, seed 3: unstable" in failed.where
+    assert failed.cause == "unstable" and "(the loop is unstable in its last phase)" in " ".join(repr(found).split())
+    assert failed.cause == json.loads(to_json(to_content(failed)))["cause"]
     assert not any("e-" in row.where and "allowed" in row.where for row in found.requirements)
     assert repr(found).startswith("not met") and "simulation_failures 7, limit ≤ 0" in repr(found)
 
@@ -149,8 +152,9 @@ def test_a_plant_that_cannot_be_simulated_has_not_passed(controller, linear, sta
     stuck = replace(linear, parameters=thor.update(f_c=500.0, v_s=1e-9), models={"stand": stand}, worst={})
     found = stuck.with_simulation()
     (row,) = [item for item in found.requirements if item.name == "simulation_failures"]
-    assert not row.met
-    assert "smooth the friction" in row.where
+    assert not row.met and row.cause == "not simulated"
+    assert (row.plant, row.draw.number) == ("stand", "nominal") and row.scenario
+    assert "smooth the friction" in row.where and f"stand, {row.scenario}, draw nominal" in row.where
     assert found.simulated.verification is None
     assert found.simulated.simulation_dict()["passed"] is False
 
@@ -176,7 +180,7 @@ def test_a_controller_without_its_design_plant_is_refused(controller, stand, tho
 
 
 def test_what_breaks_is_said_and_the_rest_is_had(controller, stand, thor, monkeypatch):
-    def broken(*_):
+    def broken(*_, **__):
         raise np.linalg.LinAlgError("Singular matrix")
 
     module = sys.modules["seaopt.robustness.certificate.simulated"]  # the package's name of it is the function
@@ -196,7 +200,7 @@ def test_what_applies_and_could_not_be_checked_stands_beside_the_verdict(
 ):
     """It was a note below a certificate that is met, as of a plant to which it does not apply."""
 
-    def broken(*_):
+    def broken(*_, **__):
         raise np.linalg.LinAlgError("Singular matrix")
 
     monkeypatch.setattr(sys.modules["seaopt.robustness.certificate.simulated"], "large_signal", broken)

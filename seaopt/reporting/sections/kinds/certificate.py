@@ -32,6 +32,7 @@ from seaopt.robustness.certificate.certificate import NO_MODEL
 from seaopt.robustness.certificate.compensation import GRAVITY_COMPENSATION
 from seaopt.robustness.certificate.requirement import DESIGN_PLANT, Failure, Requirement, group_failures
 from seaopt.robustness.certificate.scheduled import name_rate_unit
+from seaopt.robustness.certificate.simulated import SIMULATION_FAILURES
 from seaopt.robustness.uncertainty.draws import Plants
 from seaopt.units import unit_after
 
@@ -55,6 +56,22 @@ REMEDIES = {
     "min_schedule_rate": "a smaller min_rate in [controller.schedule], or a higher bandwidth_hz",
     "log_sensitivity": "seaopt fit --explain, which names what the model may lack, or a lower bandwidth_hz",
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
+}
+SLOWER = "a lower bandwidth_hz, or more reserve, in [controller]"
+# What a run did that it may not, by the kind of its fault, and what to change.
+CAUSES = {
+    "overflow": ("its numbers overflow", SLOWER),
+    "unstable": ("the loop is unstable in its last phase", SLOWER),
+    "growth": ("a motion grows under a constant reference", SLOWER),
+    "outbreak": ("noise sets off a motion that grows", SLOWER),
+    "gate": ("the gate takes a true reading for a fault", ""),
+    "current": ("the command is above its limit", ""),
+    "rest": ("the limit of the command does not hold the plant at rest", "a larger limit of the command"),
+    "no event": ("what is to happen does not", ""),
+    "not simulated": (
+        "a scenario could not be simulated to its accuracy, so that nothing is known of it",
+        "sticks = true of the plant, a larger v_s, or narrower ranges of its friction",
+    ),
 }
 
 
@@ -160,7 +177,7 @@ def _advise_ranges(certificate: Certificate) -> tuple[Step, ...]:
 
 def advise(row: Requirement, *controllers: Controller, models: Plants) -> str:
     """Return what to change where a requirement is not met: by the limits that bind in the laws it is of."""
-    limit, remedy = BY_REQUIREMENT.get(row.name), REMEDIES.get(row.name, "")
+    limit, remedy = BY_REQUIREMENT.get(row.name), find_remedy(row)
     if limit is not None:
         plants = {DESIGN_PLANT, *(name for law in controllers for name in law.robust_to)}
         designs = [law.design[0] for law in controllers if law.design is not None]
@@ -179,10 +196,28 @@ def explain_failure(failure: Failure, *controllers: Controller, models: Plants) 
     """Return what a certificate fails on, by its worst case; `controllers`: the laws it is of."""
     row = failure.worst
     if failure.unstable:
-        what = f"unstable on {', '.join(failure.subjects)}"
-        return Reason(what=what, where=f"{advise(row, *controllers, models=models)}{failure.consequence}")
+        return Reason(
+            what=state_failure(failure), where=f"{advise(row, *controllers, models=models)}{failure.consequence}"
+        )
+    return Reason(what=state_failure(failure), where=row.where, count=failure.count)
+
+
+def state_failure(failure: Failure) -> str:
+    """Return what a certificate fails on, by its worst case: the figure and its limit, and what a run did."""
+    row = failure.worst
+    if failure.unstable:
+        return f"unstable on {', '.join(failure.subjects)}"
     value, limit = format_number(row.value, 4), format_number(row.limit, 4)
-    return Reason(what=f"{row.name} {value}, limit {row.sense} {limit}", where=row.where, count=failure.count)
+    cause = CAUSES[row.cause][0] if row.cause in CAUSES else row.cause
+    counted = row.name == SIMULATION_FAILURES and cause  # what has a figure of its own is said by its name
+    return f"{row.name} {value}, limit {row.sense} {limit}{f' ({cause})' if counted else ''}"
+
+
+def find_remedy(row: Requirement) -> str:
+    """Return what to change where a requirement is not met, whatever binds in its law, besides its own remedy."""
+    limit = BY_REQUIREMENT.get(row.name)
+    by_cause = CAUSES[row.cause][1] if row.name == SIMULATION_FAILURES and row.cause in CAUSES else ""
+    return REMEDIES.get(row.name, by_cause if limit is None else limit.remedy)
 
 
 def summarise(certificate: Certificate) -> list[KeyFigure]:
