@@ -7,7 +7,7 @@ radius R (`seaopt.frequency.residual`). Around the model's own response G the la
 - *refuted*, where a line has :math:`|1 + C (G + \hat E)| + |C| R(\alpha/m) < 1/M_s`, or all discs leave zero out and
   the loop turns about it once more, or less, than the model's;
 - *confirmed*, by samples that were not fitted, where all lines have :math:`|1 + C(G + \hat E)| - x - M_s x^2/2 \ge
-  1/M_s`, x being the radial bound of R, and lie about the crossover;
+  1/M_s`, x being the radial bound of R, lie about the crossover, and turn about zero as the model's do;
 - *undecided* otherwise. Samples that were fitted are not independent: they can refute, and confirm nothing.
 
 A log whose input carries its noise judges nothing: where it was taken under a law (stated, or found in it), or the fit
@@ -336,4 +336,16 @@ def _confirm(controller: Controller, lines: _WindowLines, limit: float) -> tuple
     f = lines.f[find_band(lines.f, kept)]
     low, high = _ask_band(controller, lines)
     covers = lines.gapless and f.size and f[0] <= low and f[-1] >= high
-    return (float(f[0]), float(f[-1])) if covers else None
+    inside = (lines.f >= f[0]) & (lines.f <= f[-1]) if covers else np.zeros(lines.f.size, dtype=bool)
+    turns = covers and _turns_alike((1.0 + lines.loop)[inside], lines.error[inside], x[inside])
+    return (float(f[0]), float(f[-1])) if turns else None
+
+
+def _turns_alike(model: Any, error: Any, radius: Any) -> bool:
+    """Tell whether 1 + L turns about zero as often as the model's, where no line's disc holds zero: it turns as the
+    model does along the lines, begins on the model's side, and leaves the model, which stands alone above, at the end.
+    """
+    ratio = 1.0 + error / model
+    steps = np.angle(ratio[1:] / ratio[:-1])
+    ends = ratio[0].real > 0.0 and abs(error[-1]) + radius[-1] < abs(model[-1])
+    return bool(ends and np.all(np.abs(steps) < 0.5 * np.pi) and abs(np.sum(steps)) < np.pi)
