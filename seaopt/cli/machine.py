@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,28 +23,32 @@ from seaopt.control import Controller, ForceMPC, MPCSpec, ScheduledController
 from seaopt.control.laws.delay import find_drive_delay
 from seaopt.control.mpc.stored import TUNE_AGAIN, check_described
 from seaopt.errors import ProblemError, SeaoptError
+from seaopt.estimation import Fit
 from seaopt.files import read_json, to_json, write_json, write_text
-from seaopt.logs import write_log
+from seaopt.logs import Quality, write_log
+from seaopt.logs.quality.report import QUALITY_SCHEMA
 from seaopt.machine import Acceptance, BringUp, Stage, accept, bring_up
-from seaopt.machine.acceptance import take_ranges
+from seaopt.machine.acceptance import ACCEPT_AGAIN, ACCEPTANCE_SCHEMA, hash_source, take_ranges
 from seaopt.machine.bringup.files import write_stage
 from seaopt.machine.bringup.page import write_bring_up_page
-from seaopt.machine.bringup.stages import BRINGUP_SCHEMA, FULL, OF_A_STAGE, slow_down
+from seaopt.machine.bringup.plan import BRINGUP_SCHEMA, PLAN_AGAIN
+from seaopt.machine.bringup.stages import FULL, OF_A_STAGE, slow_down
 from seaopt.machine.page.page import write_acceptance_page
 from seaopt.machine.response.periods import Played
-from seaopt.machine.stepped import Source
+from seaopt.machine.stepped import Source, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.problem import Problem, certify_problem, tune_problem
 from seaopt.problem.loop_logs import read_loop_log
-from seaopt.problem.stages import design_mpc, read_law
+from seaopt.problem.stages import design_mpc, read_law, read_sweep
+from seaopt.reporting.responses import Responses
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
 from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.signals import REFERENCE, STATUS
 
-FILE, PAGE = "acceptance.json", "acceptance.html"
+FILE, PAGE, QUALITY = "acceptance.json", "acceptance.html", "quality.json"
 BRING_UP, PLAN = "bringup", "bringup.json"  # the folder of the stages, and what they are
 LATER = 5e-3  # s, by which a drive may be later than twice what it was
 AGAIN = "again"  # the folder of accepted logs, for a fit
@@ -79,14 +84,9 @@ def accept_logs(
     """
     session = Session(problem, folder)
     law, errors = session.law(), Terminal(stderr=True)
-    source: Source = law if session.problem.mpc is None else session.plan()
     session.warn_of_design(session.problem.certified_plants().values())
-    path = folder / FILES["tune"]
-    if stage is not None:
-        path = folder / BRING_UP / stage / FILES["tune"]
-        if not path.is_file():
-            raise ProblemError(f"--stage {stage}: {path} is not there; make it: seaopt bringup {problem} -o {folder}")
-        source = _read_stage(session, path)
+    source = _find_law(session, stage)
+    path = folder / FILES["tune"] if stage is None else folder / BRING_UP / stage / FILES["tune"]
     controller = law.controllers[0] if isinstance(law, ScheduledController) else law
     units = _list_units(controller)
     if isinstance(source, ScheduledController):
@@ -114,7 +114,7 @@ def accept_logs(
         )
     certificate, broken = _find_certificate(folder, stage, path)
     result = replace(result, certificate=certificate, broken=broken)
-    content = write(result, session, logs)
+    content = write(result, session, logs, stage)
     again = write_again(result, session)
     if again:
         errors.wrap(f"note: to fit these logs too, put the tables of {again[-1]} into the problem file")
@@ -203,6 +203,62 @@ def _find_certificate(
     return ("met" if all(met) else "failed") if met else "missing", ()
 
 
+def read_besides(session: Session) -> dict[str, Any]:
+    """Return what lies in a session's folder besides fit, law and certificate, as it was written, by the commands that
+    made it; what is of another problem or law is left out with a remark. Raises FileError: a file is damaged.
+    """
+    folder, problem = session.folder, session.problem
+    plan, kinds = folder / BRING_UP / PLAN, dict[str, Callable[[], Any]]()
+    kinds["sweep"] = lambda: session.read_besides("sweep", partial(read_sweep, problem, session.parameters()))
+    fit = session.read_besides("fit", Fit.from_dict)
+    kinds["frf"] = lambda: session.read_besides("frf", partial(Responses.from_dict, problem=problem, fit=fit))
+    if (folder / QUALITY).exists():
+        kinds["inspect"] = lambda: Quality.from_dict(read_json(folder / QUALITY, QUALITY_SCHEMA))
+    if (folder / FILE).exists():
+        kinds["accept"] = lambda: _read_acceptance(session)
+    if plan.exists():
+        kinds["bringup"] = lambda: _read_bring_up(session, plan)
+    found = dict[str, Any]()
+    for name, read in kinds.items():
+        try:
+            found[name] = read()
+        except ProblemError as error:
+            session.say(f"left out: {error}")
+    return {name: result for name, result in found.items() if result is not None}
+
+
+def _read_acceptance(session: Session) -> Acceptance:
+    """Return the acceptance of a folder. Raises ProblemError: it is of a law that was tuned or planned again since."""
+    path = session.folder / FILE
+    content = read_json(path, ACCEPTANCE_SCHEMA, remedy=ACCEPT_AGAIN)
+    source = _find_law(session, content.get("stage"))
+    law = stand(source, (content.get("place") or {}).get("value"))
+    if not isinstance(source, ForceMPC) and content.get("law") != hash_source(law):
+        raise ProblemError(f"{path}: is of another law than is there now; {ACCEPT_AGAIN}")
+    return Acceptance.from_dict(content, source)
+
+
+def _read_bring_up(session: Session, path: Path) -> BringUp:
+    """Return the bring-up of a folder. Raises ProblemError: a stage has another law than it had."""
+    content, link = read_json(path, BRINGUP_SCHEMA, remedy=PLAN_AGAIN), _find_link(session, _find_law(session, None))
+    laws = {str(stage["name"]): _find_law(session, str(stage["name"])) for stage in content["stages"]}
+    final = [laws[stage["name"]] for stage in content["stages"]][-1]
+    if hash_source(final) != hash_source(_find_law(session, None)):
+        raise ProblemError(f"{path}: is of another law than is there now; {PLAN_AGAIN}")
+    return BringUp.from_dict(content, laws, link)
+
+
+def _find_law(session: Session, stage: str | None) -> Source:
+    """Return the law of a folder, or that of a stage of its bring-up. Raises ProblemError: the stage has none."""
+    if stage is None:
+        law = session.law()
+        return law if session.problem.mpc is None else session.plan()
+    path = session.folder / BRING_UP / stage / FILES["tune"]
+    if not path.is_file():
+        raise ProblemError(f"stage {stage}: {path} is not there; make it: {session.spell('bringup')}")
+    return _read_stage(session, path)
+
+
 def _read_stage(session: Session, path: Path) -> Source:
     """Return the law of a stage of a bring-up."""
     problem, content = session.problem, read_json(path, SCHEMAS["tune"])
@@ -263,10 +319,10 @@ def _find_others(session: Session, folder: Path, excluded: Path) -> dict[str, So
     return controllers
 
 
-def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[str, Any]:
-    """Write acceptance.json and its page; return the content of the first."""
+def write(result: Acceptance, session: Session, logs: Sequence[Path], stage: str | None = None) -> dict[str, Any]:
+    """Write acceptance.json and its page; return the content of the first. `stage`: of whose law the logs are."""
     command = spell_call()
-    content = _describe(result, session) | {"problem": session.problem.source}
+    content = _describe(result, session) | {"problem": session.problem.source, "stage": stage}
     write_json(session.folder / FILE, content)
     write_acceptance_page(
         result,
@@ -313,8 +369,7 @@ def plan_bring_up(
 ) -> bool:
     """Plan the stages of the folder's controller, write and print them; return whether each has a certified law."""
     session, zeroing = Session(problem, folder), parse_tare(tare)
-    law, source, errors = session.law(), session.parameters(), Terminal(stderr=True)
-    controller: Source = law if session.problem.mpc is None else session.plan()
+    source, errors, controller = session.parameters(), Terminal(stderr=True), _find_law(session, None)
     if zeroing is not None and isinstance(controller, ForceMPC):
         raise ProblemError(f"--tare {tare}: predictive control has no C beside it that averages a zero; leave it out")
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -48,7 +47,6 @@ from seaopt.problem.stages import (
     design_mpc,
     fit_problem,
     read_law,
-    read_sweep,
     score_problem,
     simulate_experiment,
     sweep_problem,
@@ -315,7 +313,7 @@ class Session:
             self._say_once("note", [note])
         return content
 
-    def _read_besides(self, stage: str, make: Callable[[dict[str, Any]], T]) -> T | None:
+    def read_besides(self, stage: str, make: Callable[[dict[str, Any]], T]) -> T | None:
         """Return a result that another stage can do without; None where there is none of this problem."""
         try:
             return make(self._read(stage)) if self._path(stage).exists() else None
@@ -421,7 +419,7 @@ class Session:
         if not self.problem.table.experiment:
             raise ProblemError(f"{self.problem.source}: has no [[experiment]] to estimate from; {WRITE_ONE}")
         experiments = self.experiments()
-        fitted = self._read_besides("fit", Fit.from_dict)
+        fitted = self.read_besides("fit", Fit.from_dict)
         responses = estimate_responses(experiments, self.problem, fitted, self.stretch_s, tell)
         self.results["frf"] = responses
         self._write("frf", {"schema": SCHEMAS["frf"], **responses.to_dict()})
@@ -465,8 +463,11 @@ class Session:
                 used = fitted.experiments or self.problem.choose_fitted(self.experiments())
                 self.results["fit"] = replace(fitted, experiments=used)
                 results.append(self.results["fit"])
-        swept = self._read_besides("sweep", partial(read_sweep, self.problem, self.parameters()))
-        results += [] if swept is None else [swept]
+        from seaopt.cli.machine import read_besides  # deferred: it reads with a session
+
+        besides = read_besides(self)
+        self.results.update(besides)
+        results += besides.values()
         tuned = "tune" in self.results or self._path("tune").exists()
         if self.problem.spec is not None and (tuned or not results):  # a report is of something
             law = self.law()
@@ -509,7 +510,7 @@ class Session:
 
     def _judged(self, stages: list[str]) -> list[str]:
         """Return what has a verdict: of a report also what the problem file expects."""
-        return ["fit", "tune", "certify", "expect"] if "report" in stages else stages
+        return ["fit", "tune", "certify", "accept", "bringup", "expect"] if "report" in stages else stages
 
     def _expected(self) -> list[tuple[bool, str]]:
         """Return what came of each expectation of the problem file."""

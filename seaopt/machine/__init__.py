@@ -3,7 +3,8 @@
 from seaopt.machine.acceptance import Acceptance, accept
 from seaopt.machine.bringup.expected import Band
 from seaopt.machine.bringup.files import write_bring_up
-from seaopt.machine.bringup.stages import BringUp, Stage, bring_up
+from seaopt.machine.bringup.plan import BringUp, Stage
+from seaopt.machine.bringup.stages import bring_up
 from seaopt.machine.causes import Cause
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.explanations import Difference

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 import seaopt as so
 from seaopt.cli.main import app
 from seaopt.files import write_json
+from seaopt.machine import bring_up
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.robustness.certificate.simulated import SIMULATIONS
 from tests.c_code import CompiledLog
@@ -179,6 +181,44 @@ def test_what_is_advised_of_an_uneven_clock_or_none_can_be_written_and_does(fold
     (row,) = json.loads((folder / "out" / "acceptance.json").read_text())["replay"]["logs"]
     assert row["rate_hz"] == pytest.approx(1000.0) and row["ticks"] == (len(kept) if clock == "jitter" else len(log))
     assert clock == "none" or (row["stretches"] == 2 and row["gaps"]["longest"] == 5000)
+
+
+def test_a_report_shows_what_lies_in_the_folder_as_its_commands_printed_it(folder, accept, tmp_path, monkeypatch):
+    """Quality, acceptance and bring-up are read back: nothing is judged, planned or certified again."""
+    from typer.testing import CliRunner
+
+    assert accept(folder / "good.csv").exit_code == 0
+    here = shutil.copytree(folder, tmp_path / "copy")
+    problem = here / "stand.toml"
+
+    def run(command, *arguments):
+        return CliRunner().invoke(app, [command, *map(str, arguments)])
+
+    assert run("inspect", here / "good.csv", "-o", here / "out").exit_code in (0, 1)
+    monkeypatch.setattr("seaopt.cli.machine.bring_up", partial(bring_up, fractions=()))  # no slower laws are tuned
+    planned = run("bringup", problem, "-o", here / "out", "--limit", "F1=900")
+    assert planned.exit_code == 0, planned.output
+    for name in ("accept", "bring_up", "certify_problem"):
+        monkeypatch.setattr(f"seaopt.cli.machine.{name}", None)
+    done = run("report", problem, "-o", here / "out")
+    assert done.exit_code == 0, (done.output, done.exception)
+    text, page = " ".join(done.output.split()), (here / "out" / "report.html").read_text()
+    assert (
+        "Bring-up: 1 of 1 stage with a certified law" in text and "the law makes the logged command in 1 of 1" in text
+    )
+    for words in ("Stage full", "expected at most", "Quality of the logs", "good.csv", "Measured and model"):
+        assert words in page, words
+
+    path = here / "out" / "bringup" / "bringup.json"
+    content = path.read_text()
+    path.write_text(content.replace('"met": true', '"met": false', 1))
+    edited = run("report", problem, "-o", here / "out")
+    assert edited.exit_code != 0 and "bringup.json: was edited" in str(edited.exception)
+    path.write_text(content)
+    law = here / "out" / "bringup" / "full" / "controller.json"
+    law.unlink()
+    lost = run("report", problem, "-o", here / "out")
+    assert lost.exit_code == 0 and "left out: stage full" in " ".join(lost.output.split())
 
 
 @pytest.mark.parametrize("again", [False, True])

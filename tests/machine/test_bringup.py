@@ -13,6 +13,8 @@ import seaopt as so
 from seaopt.formatting import format_number
 from seaopt.machine.bringup.excitation import design_excitation
 from seaopt.machine.bringup.files import write_bring_up
+from seaopt.robustness import Requirement
+from seaopt.robustness.certificate.requirement import DrawnAt
 from tests.machine.simulator import Bench, Machine
 
 SHARE = 0.4
@@ -47,10 +49,16 @@ def test_the_stages_lead_up_to_the_full_law_and_each_is_certified(plan, controll
 
 def test_a_stage_whose_law_is_not_certified_says_on_what(plan):
     first, *others = plan.stages
-    rows = [replace(row, met=row.name != "max_sensitivity") for row in first.certificate.requirements]
-    failed = replace(first, certificate=replace(first.certificate, requirements=tuple(rows)))
+    rows = [replace(row, met=row.name != "max_sensitivity") for row in first.requirements]
+    lost = DrawnAt(number="2", parameters={"f_c": 60.0}, seed=3)
+    words = {"plant": "stand", "scenario": "small step", "draw": lost, "text": "512 steps leave an error of 0.1"}
+    rows += [Requirement(name="simulation_failures", limit=0.0, value=1.0, met=False, cause="not simulated", **words)]
+    failed = replace(first, requirements=tuple(rows))
     text = " ".join(repr(replace(plan, stages=(failed, *others))).split())
-    assert text.startswith("not met") and "its law failed, on max_sensitivity: stage_1" in text
+    assert text.startswith("not met") and "stage_1: the certificate of its law failed, on max_sensitivity " in text
+    assert "on simulation_failures 1, limit ≤ 0 (a scenario could not be simulated" in text
+    assert "stand, small step, draw 2, seed 3 at f_c = 60: 512 steps leave an error of 0.1" in text
+    assert "sticks = true of the plant" in text  # the remedy
 
 
 def test_stages_before_the_last_leave_out_the_sweeps_of_which_nothing_is_required(plan):
@@ -201,6 +209,28 @@ def test_a_stage_moves_the_motor_against_its_friction_or_says_that_it_does_not(
     assert ("dry friction held the motor" in said) is not moves
 
 
+def test_two_stages_that_are_the_same_experiment_are_one(rubbing):
+    """With less effort both take what moves the motor: the second would be played for nothing."""
+    plant, values, law, certificate = rubbing
+    certified = []
+
+    def refuse(fraction):
+        raise so.SeaoptError("none")
+
+    def certify(lower):
+        certified.append(lower.command_limit)
+        return replace(certificate, controller=lower)
+
+    plan = so.bring_up(
+        law, {"knee": plant}, values, samples=5, share=0.5, fractions=(0.25, 0.3), limits={"tau_s": 20.0},
+        certificate=certificate, tune_stage=refuse, certify_stage=certify,
+    )  # fmt: skip
+    assert [stage.name for stage in plan.stages] == ["stage_1", "full"] and len(certified) == 1
+    assert "stage_2 would be the same experiment, and is left out" in plan.stages[0].note
+    assert repr(plan).count("same experiment") == 1
+    assert plan.stages[1].excitation.amplitude > 1.1 * plan.stages[0].excitation.amplitude
+
+
 def test_where_friction_makes_two_bandwidths_both_are_said_with_which_is_which(plan, tmp_path):
     """The stuck plant is that of the equations: a motor that does not move behind its spring, but for v_s."""
     from seaopt.machine.bringup.page import write_bring_up_page
@@ -274,7 +304,7 @@ def test_a_stage_of_less_effort_has_room_for_the_noise_of_what_it_reads(gentle, 
     machine is told from one with twice the friction."""
     stages, values = gentle
     stage = stages[0]
-    assert "beside which the noise of what it reads has no room" in stage.note and stage.certificate.met
+    assert "beside which the noise of what it reads has no room" in stage.note and stage.met
     bench, reference = Bench(compiler, tmp_path, stage.controller), stage.excitation.reference
     log = bench.log(Machine.of_knee(values), reference, noise=0.05)
     assert np.max(np.abs(log["I"])) < stage.controller.command_limit < 15.0

@@ -29,6 +29,7 @@ CLOSE = (0.85, 0.9, 0.95, 1.0, 1.05, 1.1)  # of the bandwidth: lines besides
 TRIES = 30  # sets of phases
 JOINED = 4  # ticks to either side of where a set of phases follows another, that are to be alike
 LONGEST_S = 4.0  # of a period, but where lines have to lie lower
+FADES = 2  # periods: one that fades in, and one that fades out
 
 
 @record(eq=False)
@@ -37,34 +38,53 @@ class Excitation:
 
     sample_time_s: float
     bias: float
-    waves: Float[np.ndarray, "phases period"]  # about the bias
+    amplitude: float  # the largest magnitude about the bias
+    period: int  # ticks
+    phases: int  # sets of them
     lines: Int[np.ndarray, " m"]  # of a period
     periods: int  # of each set of phases
     peaks: Mapping[str, float]  # largest magnitudes: of the command and of each output of the plant
     limits: Mapping[str, float]  # of those that are limited
+    waves: Float[np.ndarray, "phases period"] | None = None  # about the bias; not read back from a file
 
     @property
     def frequency_hz(self) -> Float[np.ndarray, " m"]:
         """The lines, in Hz."""
-        return self.lines / (self.waves.shape[1] * self.sample_time_s)
+        return self.lines / self.period_s
 
     @property
-    def amplitude(self) -> float:
-        """The largest magnitude about the bias."""
-        return float(np.max(np.abs(self.waves)))
+    def period_s(self) -> float:
+        """How long a period lasts."""
+        return self.period * self.sample_time_s
+
+    @property
+    def lasts_s(self) -> float:
+        """How long all of it lasts."""
+        return (self.phases * self.periods + FADES) * self.period_s
 
     @property
     def fade(self) -> Float[np.ndarray, " period"]:
         """What a period that fades in is multiplied by."""
-        share = np.arange(self.waves.shape[1]) / self.waves.shape[1]
+        share = np.arange(self.period) / self.period
         return share**2 * (3.0 - 2.0 * share)  # which a target computes without a library
+
+    def list_waves(self) -> Float[np.ndarray, "phases period"]:
+        """Return one period about the bias for each set of phases. Raises ControlError: it was read from a file, which
+        has none of them.
+        """
+        if self.waves is None:
+            raise ControlError(
+                "the reference was read from bringup.json, which has its size and lines alone; it is in reference.csv "
+                "of its stage, or plan it again: seaopt bringup"
+            )
+        return self.waves
 
     @property
     def reference(self) -> Float[np.ndarray, " n"]:
         """All of it: a period that fades in, then every set of phases for its periods, then a period that fades out."""
-        first, last = self.waves[0], self.waves[-1]
-        rise = self.fade
-        played = np.concatenate([np.tile(wave, self.periods) for wave in self.waves])
+        waves, rise = self.list_waves(), self.fade
+        first, last = waves[0], waves[-1]
+        played = np.concatenate([np.tile(wave, self.periods) for wave in waves])
         return np.concatenate([rise * (self.bias + first), self.bias + played, rise[::-1] * (self.bias + last)])
 
 
@@ -124,7 +144,10 @@ def design_excitation(
     return Excitation(
         sample_time_s=controller.sample_time_s,
         bias=bias,
-        waves=scale * np.array(waves),
+        amplitude=float(np.max(np.abs(played := scale * np.array(waves)))),
+        period=period,
+        phases=phases,
+        waves=played,
         lines=lines,
         periods=periods,
         peaks={name: at_bias[name] + scale * peak for name, peak in peaks.items()},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -11,14 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.bench import Sensors
+from seaopt.codec import OrInfinite
 from seaopt.control import Controller
 from seaopt.control.loops.moved_link import MOVED, find_position
 from seaopt.control.loops.outer_loop import OuterLoop
-from seaopt.control.running.closed_loop import LoopRun
 from seaopt.control.scheduling.scheduled_controller import place_variable
 from seaopt.errors import ControlError, suggestion
 from seaopt.machine.bringup.excitation import Excitation, design_excitation
-from seaopt.machine.bringup.predicted import find_share, list_broken, predict_played
+from seaopt.machine.bringup.predicted import DRAWN, find_share, list_broken, predict_played
 from seaopt.machine.design_run import run_design
 from seaopt.machine.response.enclosed import enclose_outer
 from seaopt.machine.response.judged import Prediction
@@ -36,7 +37,8 @@ RAISES, ONWARD = 4, 1.1  # times that an amplitude is raised to it, and by which
 SILENT = 1e-3  # share of the limits that a reference takes beside which noise is looked at by itself
 ROOM, LESS, LOWERS = 0.95, 0.85, 8  # of the limit of the command, below which peaks stay, and steps down to it
 SEED = 1
-NOISE_RUNS = 4  # with other noise each, whose largest peaks count
+NOISE_RUNS = 20  # with noise, at least
+BELOW = 0.998  # by t: of peaks, whose distribution is Gumbel's, 99 % of one more machine
 PERIODS, PERIODS_OF_PHASES = 10, 4  # of one set of phases, and of each of six
 
 
@@ -45,9 +47,9 @@ class Band:
     """A response over time or frequency, and between what it lies on the draws."""
 
     at: tuple[float, ...]  # s or Hz
-    nominal: tuple[float, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
+    nominal: tuple[OrInfinite, ...]
+    low: tuple[OrInfinite, ...]
+    high: tuple[OrInfinite, ...]
 
 
 @record(eq=False)
@@ -152,7 +154,7 @@ def expect(
     plant, values = controller.design
     loops = [shown.close(plant, each) for each in (values, *(place_values(plant, values, each) for each in draws))]
     f, size = excitation.frequency_hz, abs(per_given)
-    stepped = [loop.simulate(np.full(count or excitation.waves.shape[1], per_given)) for loop in loops]
+    stepped = [loop.simulate(np.full(count or excitation.period, per_given)) for loop in loops]
     steps, efforts = (np.array([run[k] for run in stepped]) for k in (0, 1))
     limit = controller.command_limit
     return {
@@ -172,7 +174,7 @@ def find_noise(controller: Controller, options: Mapping[str, Any]) -> float:
     given: dict[str, Any] = {key: options[key] for key in ("limits", "seed")}
     silent = design_excitation(controller, share=SILENT, bias=0.0, phases=1, periods=PERIODS, **given)
     runs = replace(controller, outer=None)
-    return _add_noise(controller, runs, silent, options["sensors"])[controller.command.input]
+    return _find_peaks(controller, runs, silent, (), options["sensors"])[controller.command.input]
 
 
 def split_limits(
@@ -244,14 +246,12 @@ def _excite(
     given["phases"], given["periods"] = (LEAST_PHASES, PERIODS_OF_PHASES) if dry else (1, PERIODS)
     share, most, friction = options["share"], options["most"], find_friction(controller)
 
-    def play(share: float) -> tuple[Excitation, LoopRun | None, float | None]:
+    def play(share: float) -> tuple[Excitation, float | None]:
         excitation = design_excitation(controller, share=share, **given)
-        run = _run_terms(controller, runs, _scale(excitation, per_given))
-        return excitation, run, None if run is None or not dry else _measure_swing(controller, excitation, run)
+        return excitation, _measure_swing(controller, runs, _scale(excitation, per_given)) if dry else None
 
-    def find_peaks(excitation: Excitation, run: LoopRun | None) -> dict[str, float]:
-        peaks = _add_noise(controller, runs, _scale(excitation, per_given), options["sensors"])
-        return peaks if run is None else _take_larger(peaks, {**run.outputs, command: run.current})
+    def find_peaks(excitation: Excitation) -> dict[str, float]:
+        return _find_peaks(controller, runs, _scale(excitation, per_given), draws, options["sensors"])
 
     @cache  # runs of all draws, mostly asked for twice at the share that is played
     def predict(share: float) -> Prediction:
@@ -262,26 +262,26 @@ def _excite(
         return not list_broken(controller, predict(share))
 
     limit, command = controller.command_limit, controller.command.input
-    excitation, run, effort = play(share)
+    excitation, effort = play(share)
     for _ in range(RAISES):
         if effort is None or effort >= MOVES * friction or share >= most:
             break
         share = min(share * max(MOVES * friction / max(effort, 1e-12), ONWARD), most)
-        excitation, run, effort = play(share)
+        excitation, effort = play(share)
     enough, predicts = None, dry and runs.outer is None
     if predicts:
         enough = share if keeps(share) else find_share(keeps, share, most)
         if enough is not None and share < enough <= most:
             share = enough
-            excitation, run, effort = play(share)
+            excitation, effort = play(share)
     chosen = share
-    peaks = find_peaks(excitation, run)
+    peaks = find_peaks(excitation)
     for _ in range(LOWERS):  # a period in which the command is at its limit is lost for the response
         if limit is None or peaks[command] < ROOM * limit:
             break
         share *= LESS
-        excitation, run, effort = play(share)
-        peaks = find_peaks(excitation, run)
+        excitation, effort = play(share)
+        peaks = find_peaks(excitation)
     fields: dict[str, Any] = {"effort": effort, "friction": friction if dry else None}
     if predicts:
         fields["prediction"] = predict(share)
@@ -292,55 +292,70 @@ def _excite(
 
 def _scale(excitation: Excitation, per_given: float) -> Excitation:
     """Return the reference of a law as it is given to what runs."""
-    return replace(excitation, waves=excitation.waves / per_given, bias=excitation.bias / per_given)
+    waves, size = excitation.list_waves() / per_given, abs(per_given)
+    return replace(excitation, waves=waves, amplitude=excitation.amplitude / size, bias=excitation.bias / per_given)
 
 
-def _run_terms(controller: Controller, runs: Controller, given: Excitation) -> LoopRun | None:
-    """Return the run of a reference where the law has terms, or where one set of phases follows another: its peaks may
-    be larger than those of the lines.
-    """
-    if controller.design is None or (controller.compensation is None and len(given.waves) == 1):
-        return None
-    return run_design(runs, [controller.design[1]], given.reference)
-
-
-def _measure_swing(controller: Controller, excitation: Excitation, run: LoopRun) -> float:
-    """Return the most by which the effort swings about its middle while the periods are played."""
-    period = excitation.waves.shape[1]
+def _measure_swing(controller: Controller, runs: Controller, given: Excitation) -> float:
+    """Return the most by which the effort of the design plant swings about its middle while the periods are played."""
+    assert controller.design is not None
+    run, period = run_design(runs, [controller.design[1]], given.reference), given.period
     return float(np.ptp(run.current[0, period:-period])) / 2.0 / abs(controller.per_effort)
 
 
-def _add_noise(
-    controller: Controller, runs: Controller, given: Excitation, sensors: Sensors | None
+def _find_peaks(
+    controller: Controller,
+    runs: Controller,
+    given: Excitation,
+    draws: Sequence[Mapping[str, float]],
+    sensors: Sensors | None,
 ) -> dict[str, float]:
-    """Return the peaks of a reference where the readings have their noise and rounding: of the command, the plant and
-    what is read, those of `NOISE_RUNS` runs where they are larger. A reading's noise is drawn anew for its own peak,
-    which does not change how likely it is: white noise reaches the plant a sample later at the earliest.
+    """Return how large the command, the plant's outputs and what is read become at most under a reference: by its lines
+    where the machine is known, linear and read without error, else by runs of the design plant and of draws, each with
+    its own noise. With dry friction the lines tell nothing: they are those of a machine without it. A reading's noise
+    is drawn anew for its own peak, which does not change how likely it is: white noise reaches the plant a sample later
+    at the earliest.
     """
-    peaks = dict(given.peaks)
-    if sensors is None or controller.design is None:
-        return peaks
+    assert controller.design is not None
     plant, values = controller.design
-    noise = Sensors(noise_std=sensors.noise_std, quantisation=sensors.quantisation)
+    noise = Sensors() if sensors is None else Sensors(noise_std=sensors.noise_std, quantisation=sensors.quantisation)
     noise = noise.of(list_readings(runs, {"": plant}))
-    if not any((*noise.noise_std.values(), *noise.quantisation.values())):
-        return peaks
+    noisy = any((*noise.noise_std.values(), *noise.quantisation.values()))
+    by_lines = controller.compensation is None and given.phases == 1 and not has_dry_friction(controller)
+    if by_lines and not noisy and not draws:
+        return dict(given.peaks)
+    sets = [values, *(place_values(plant, values, draw) for draw in draws[:DRAWN])]
+    if noisy:
+        sets = [*sets, *sets * NOISE_RUNS][: max(len(sets), NOISE_RUNS)]
     seen = controller.see(plant)
     completed = seen.complete(controller.delay(values))
-    errors = {name: noise.combine_errors(seen, completed, name) for name in controller.signals if name in peaks}
-    for seed in range(NOISE_RUNS):
-        run = run_design(runs, [values], given.reference, sensors=noise, seed=seed)
+    errors = {name: noise.combine_errors(seen, completed, name) for name in controller.signals if name in given.peaks}
+    groups = math.ceil(0.5 * len(sets)) if noisy else 1  # two runs share their noise, with both signs
+    peaks: dict[str, list[float]] = {name: [] for name in given.peaks}
+    for seed in range(groups):
+        part = sets[seed::groups]
+        signs = np.resize([1.0, -1.0], len(part))  # of the noise, which is the same in all runs of a call
+        run = run_design(runs, part, given.reference, sensors=noise, seed=seed, noise_gain=signs)
         signals = {**run.outputs, controller.command.input: run.current}
         rng = np.random.default_rng((SEED, seed))
         for name, (std, step) in errors.items():
             signals[name] = np.abs(signals[name] + std * rng.normal(size=signals[name].shape)) + 0.5 * step
-        peaks = _take_larger(peaks, signals)
-    return peaks
+        for name, rows in peaks.items():
+            rows += np.max(np.abs(signals[name]), axis=1).tolist()
+    return {name: _bound_next(np.array(rows)) for name, rows in peaks.items()}
 
 
-def _take_larger(peaks: Mapping[str, float], signals: Mapping[str, Any]) -> dict[str, float]:
-    """Return peaks, or those of signals where they are larger."""
-    return {name: max(peak, float(np.max(np.abs(signals[name])))) for name, peak in peaks.items()}
+def _bound_next(peaks: Float[np.ndarray, " n"]) -> float:
+    """Return what the peak of one more machine stays below: by Student's t, of the distance from the mean of some to
+    one more. At least the largest that was seen.
+    """
+    from scipy.special import stdtrit  # deferred: 0.1 s
+
+    n, largest = peaks.size, float(np.max(peaks))
+    if n == 1:
+        return largest
+    factor = float(stdtrit(n - 1, BELOW)) * math.sqrt(1.0 + 1.0 / n)
+    return max(largest, float(np.mean(peaks) + factor * np.std(peaks, ddof=1)))
 
 
 def _band(at: Float[np.ndarray, " m"], rows: Any) -> Band:

@@ -13,7 +13,7 @@ from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
 from seaopt.machine.bringup.expected import Band, Expected
-from seaopt.machine.bringup.stages import BringUp, Stage
+from seaopt.machine.bringup.plan import BringUp, Stage
 
 PER_LINE = 8
 OUTER = "outer_"  # begins the names of what is of the outer loop
@@ -110,8 +110,8 @@ def _write_played(expected: Expected, folder: Path, what: str, prefix: str = "")
     reference, call = excitation.reference, prefix.rstrip("_") or "stage"
     time = excitation.sample_time_s * np.arange(reference.size)
     log = Log.from_arrays(time=time, reference=reference, units={"reference": unit}, source=stem)
-    period, phases = excitation.waves.shape[1], len(excitation.waves)
-    waves = ",\n".join(f"{{\n{_list_numbers(excitation.bias + wave)}\n}}" for wave in excitation.waves)
+    period, phases = excitation.period, excitation.phases
+    waves = ",\n".join(f"{{\n{_list_numbers(excitation.bias + wave)}\n}}" for wave in excitation.list_waves())
     words = {"phases": phases, "period": period, "periods": excitation.periods, "ticks": reference.size, "unit": unit}
     words |= {"what": what, "call": call, "macro": call.upper(), "stem": stem}
     header = HEADER.format(**words, bytes=4 * period * phases, rate=f"{1.0 / excitation.sample_time_s:.10g}")
@@ -129,7 +129,7 @@ def _export(stage: Stage, folder: Path, tare: Tare | None, fit_met: bool | None)
     if isinstance(source, ForceMPC):
         return [export_mpc(source, folder)]
     options: dict[str, Any] = {"log_rows": LOG_ROWS, "tare": tare, "stop": stage.stop}
-    if not stage.certificate.met:
+    if not stage.met:
         options["uncertified"] = "the certificate of the law of this stage FAILED"
     return [*export(source, folder, allow_infeasible=True, fit_met=fit_met, **options)]
 

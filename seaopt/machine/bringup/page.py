@@ -12,14 +12,16 @@ from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.bringup.expected import Band, Expected, OuterExpected
-from seaopt.machine.bringup.stages import BringUp, Stage
+from seaopt.machine.bringup.plan import BringUp, Stage
 from seaopt.machine.response.verdicts import find_friction, has_dry_friction, list_limits
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
-from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Step, Table, Verdict, mark_met
+from seaopt.reporting.sections.kinds.certificate import find_remedy, state_failure
 from seaopt.reporting.sections.kinds.controller import explain_sliding, say_bandwidths, show_stuck_bandwidth
+from seaopt.robustness.certificate.requirement import group_failures
 from seaopt.units import mechanics_of, unit_after
 
 PARTS = {"stages": "Stages", "provenance": "Provenance"}
@@ -66,19 +68,19 @@ NEXT = "Go on to the next stage when the log of this one is accepted: seaopt acc
 
 def judge(result: BringUp, commands: Commands) -> Verdict | None:
     """Return the verdict: whether the law of every stage is certified."""
-    good = [stage for stage in result.stages if stage.certificate.met]
+    good = [stage for stage in result.stages if stage.met]
+    failures = [(stage, failure) for stage in result.stages for failure in group_failures(stage.requirements)]
     reasons = tuple(
-        Reason(what=f"the certificate of its law failed, on {join_words(_list_broken(stage))}", where=stage.name)
-        for stage in result.stages
-        if not stage.certificate.met
+        Reason(
+            what=f"{stage.name}: the certificate of its law failed, on {state_failure(failure)}",
+            where=failure.worst.where,
+            count=failure.count,
+        )
+        for stage, failure in failures
     )
+    remedies = dict.fromkeys(filter(None, (find_remedy(failure.worst) for _, failure in failures)))
     text = f"Bring-up: {len(good)} of {format_count(len(result.stages), 'stage')} with a certified law"
-    return Verdict(met=result.met, text=text, reasons=reasons)
-
-
-def _list_broken(stage: Stage) -> list[str]:
-    """Return the names of the requirements that a stage's certificate does not meet."""
-    return [*dict.fromkeys(row.name for row in stage.certificate.requirements if not row.met)]
+    return Verdict(met=result.met, text=text, reasons=reasons, next=tuple(Step(text=each) for each in remedies))
 
 
 OUTER = (
@@ -199,12 +201,12 @@ def _list_row(stage: Stage) -> tuple[Any, ...]:
     ms = format_number(max(stage.sensitivity.low), 3), format_number(max(stage.sensitivity.high), 3)
     return (
         stage.name,
-        mark_met(stage.certificate.met, "certified", "not certified"),
+        mark_met(stage.met, "certified", "not certified"),
         format_number(controller.spec.bandwidth_hz, 3),
         show_stuck_bandwidth(controller),
         "none" if limit is None else controller.command.show(limit),
         f"{format_number(excitation.bias, 3)} ± {format_number(excitation.amplitude, 3)}{unit}",
-        format_number(excitation.reference.size * excitation.sample_time_s, 3),
+        format_number(excitation.lasts_s, 3),
         " to ".join(dict.fromkeys(ms)),
     )
 
@@ -258,8 +260,8 @@ def _describe_outer(stage: Stage, around: OuterExpected) -> Section:
 def _say_played(expected: Expected) -> str:
     """Return how a reference goes on."""
     excitation = expected.excitation
-    period, f = excitation.waves.shape[1] * excitation.sample_time_s, excitation.frequency_hz
-    sets, lasts = format_count(len(excitation.waves), "set"), f"{format_number(period, 3)} s"
+    f, sets = excitation.frequency_hz, format_count(excitation.phases, "set")
+    lasts = f"{format_number(excitation.period_s, 3)} s"
     return (
         f"it fades in over {lasts}, then {sets} of phases of {excitation.periods} periods of {lasts}, {f.size} lines "
         f"from {format_number(f[0], 3)} to {format_number(f[-1], 3)} Hz, then it fades out."

@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from seaopt.bench import Sensors
-from seaopt.codec import to_content
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
@@ -16,138 +17,30 @@ from seaopt.machine.bringup.expected import (
     BARELY,
     MOVES,
     SEED,
-    Expected,
-    OuterExpected,
     enclose_link,
     expect,
     expect_outer,
     find_noise,
     split_limits,
 )
-from seaopt.machine.response.verdicts import find_friction, list_limits
+from seaopt.machine.bringup.plan import BringUp, Stage
+from seaopt.machine.response.verdicts import find_friction
 from seaopt.machine.stepped import Source, Spec, change_plan, limit_spec, stand
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
-from seaopt.records import Result, Worded, record
 from seaopt.robustness import Certificate, certify, linear_controller, tune_certified
-from seaopt.signals import REFERENCE
 
-BRINGUP_SCHEMA = "seaopt/bringup/1"
 FRACTIONS, FULL = (0.25, 0.5), "full"  # what the stages before the last ask for, and the name of the last
 UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
 NOISE_ROOM = 0.75  # of a stage's limit of its command, that noise alone may take
 DRAWS = 60
+SAME_SIZE = 0.05  # relative, between references that are one experiment
+SAME = "stage_{} would be the same experiment, and is left out ({})"
 STEP_PERIODS = 6.0  # of the bandwidth, that the band of a step lasts
 OF_A_STAGE = (  # options of predictive control that a stage may have otherwise
     "bandwidth_hz", "min_sensitivity_bandwidth_hz", "current_limit_A", "command_limit", "largest_force_N",
 )  # fmt: skip
-
-
-@record(eq=False)
-class Stage(Expected):
-    """One law on its way to the machine.
-
-    Parameters
-    ----------
-    name : str
-        Of its folder.
-    source : Controller, ScheduledController or ForceMPC
-        What is exported; `controller` is it as a law: of a schedule where its variable stands, of predictive control
-        while no limit is active.
-    certificate : Certificate
-    note : str
-        In what the stage differs from what was planned.
-    place : float or None
-        Where a schedule's variable is to stand.
-    around : OuterExpected or None
-        Of the full law: what to play when its outer loop is closed, too, where the plant of its link is known, and the
-        loop is stable on it.
-    outer_unstable : bool
-        Whether the plant of the link is known, and by the model the outer loop is not stable on it.
-    """
-
-    name: str
-    source: Source
-    certificate: Certificate
-    note: str = ""
-    place: float | None = None
-    around: OuterExpected | None = None
-    outer_unstable: bool = False
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """What to log in each tick."""
-        controller, source = self.controller, self.source
-        over = () if source.over is None else (source.over,)
-        return tuple(
-            dict.fromkeys((REFERENCE, *controller.signals, *controller.further, *over, controller.command.input))
-        )
-
-
-@record(eq=False, repr=False)
-class BringUp(Result, Worded):
-    """The stages of a bring-up, the full law last."""
-
-    stages: tuple[Stage, ...]
-
-    @property
-    def met(self) -> bool:
-        """Whether the law of every stage is certified."""
-        return all(stage.certificate.met for stage in self.stages)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of bringup.json (schema seaopt/bringup/1)."""
-        return to_content(
-            {"schema": BRINGUP_SCHEMA, "met": self.met, "stages": [_describe(each) for each in self.stages]}
-        )
-
-
-def _describe(stage: Stage) -> dict[str, Any]:
-    controller, around = stage.controller, stage.around
-    return {
-        "name": stage.name,
-        "note": stage.note,
-        "met": stage.certificate.met,
-        "place": stage.place,
-        "bandwidth_hz": controller.spec.bandwidth_hz,
-        "command_limit": controller.command_limit,
-        "channels": stage.channels,
-        "rate_hz": 1.0 / controller.sample_time_s,
-        **_describe_played(stage),
-        "outer": None if around is None else _describe_played(around),
-        "outer_unstable": stage.outer_unstable,
-    }
-
-
-def _describe_prediction(expected: Expected) -> dict[str, Any] | None:
-    if expected.prediction is None:
-        return None
-    limits = {"limits": list_limits(expected.controller), "broken": expected.broken}
-    share = {"enough_share": expected.enough, "lowered": expected.lowered}
-    return to_content(expected.prediction) | limits | share
-
-
-def _describe_played(expected: Expected) -> dict[str, Any]:
-    excitation = expected.excitation
-    return {
-        "reference": {
-            "amplitude": excitation.amplitude,
-            "bias": excitation.bias,
-            "unit": expected.unit,
-            "period_s": excitation.waves.shape[1] * excitation.sample_time_s,
-            "periods": excitation.periods,
-            "phases": len(excitation.waves),
-            "frequency_hz": excitation.frequency_hz,
-        },
-        "friction": expected.motion,
-        "under_reference": _describe_prediction(expected),
-        "peaks": excitation.peaks,
-        "limits": excitation.limits,
-        "stop": expected.stop,
-        "step_size": expected.step_size,
-        "expected": {"tracking": expected.tracking, "sensitivity": expected.sensitivity, "step": expected.step},
-    }
 
 
 def bring_up(
@@ -282,13 +175,22 @@ def bring_up(
     for number, fraction in enumerate(sorted(fractions), start=1):
         part = options | {"share": share * fraction, "most": share, "place": controller.points[0]}
         law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell, part)
-        keep(_make_stage(f"stage_{number}", law, judged, note, draws, part))
+        expected = _expect_stage(law, draws, part)
+        if stages and is_same_experiment(stages[-1], expected):
+            same = SAME.format(number, note or f"the law at {fraction:g} of the bandwidth")
+            stages[-1] = replace(stages[-1], note="; ".join(filter(None, (stages[-1].note, same))))
+            continue
+        if judged is None:
+            tell("certifying the law with less effort")
+            judged = certifying(law)
+        keep(_make_stage(f"stage_{number}", law, judged, note, expected, part))
     if certificate is None:
         tell("certifying the law itself")
         certificate = certifying(controller)
     for number, place in enumerate(controller.points, start=1):
         name = FULL if len(controller.points) == 1 else f"{FULL}_{number}"
-        stage = _make_stage(name, controller, certificate, "", draws, options | {"most": share, "place": place})
+        part = options | {"most": share, "place": place}
+        stage = _make_stage(name, controller, certificate, "", _expect_stage(controller, draws, part), part)
         outer = stage.controller.outer
         at = None if controller.over is None or place is None else (controller.over, place)
         enclosed = enclose_link(stage.controller, link, at)
@@ -347,8 +249,10 @@ def _find_stage(
     certifying: Callable[[Any], Certificate],
     tell: Callable[[str], None],
     options: Mapping[str, Any],
-) -> tuple[Source, Certificate, str]:
-    """Return the law of a stage, its certificate, and in what it is another one than planned."""
+) -> tuple[Source, Certificate | None, str]:
+    """Return the law of a stage, its certificate, None where it has none yet, and in what it is another one than
+    planned.
+    """
     asked = source.spec.bandwidth_hz
     for factor in UPWARDS:
         part = fraction * factor
@@ -378,8 +282,7 @@ def _find_stage(
         f"the full law with {100.0 * part:.3g} % of its effort{above}: none near {fraction:g} of its bandwidth is "
         "certified"
     )
-    tell(f"certifying with {100.0 * part:.3g} % of the effort")
-    return lower, certifying(lower), note
+    return lower, None, note
 
 
 def _reach_friction(controller: Controller, fraction: float, share: float) -> float:
@@ -393,15 +296,34 @@ def _reach_friction(controller: Controller, fraction: float, share: float) -> fl
     return max(fraction, next((part for part in needed if part < 1.0), fraction))
 
 
+def _expect_stage(source: Source, draws: Sequence[Mapping[str, float]], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of what a law is to do, standing at its place."""
+    controller = stand(source, options["place"])
+    count = round(STEP_PERIODS / controller.spec.bandwidth_hz / controller.sample_time_s)
+    return expect(controller, draws, options, count)
+
+
+def is_same_experiment(stage: Stage, expected: Mapping[str, Any]) -> bool:
+    """Tell whether a law would do what that of a stage does: it is the same law, under about the same reference."""
+    before, after = stage.excitation, expected["excitation"]
+    laws = stage.controller.law, expected["controller"].law
+    matrices = ([law.a, law.b, law.c, law.d] for law in laws)
+    if not all(np.array_equal(*pair) for pair in zip(*matrices, strict=True)):
+        return False
+    sizes = [np.array([each.bias, each.amplitude]) for each in (before, after)]
+    return np.array_equal(before.lines, after.lines) and np.allclose(*sizes, rtol=SAME_SIZE)
+
+
 def _make_stage(
     name: str,
     source: Source,
     certificate: Certificate,
     note: str,
-    draws: Sequence[Mapping[str, float]],
+    expected: Mapping[str, Any],
     options: Mapping[str, Any],
 ) -> Stage:
-    place, controller = options["place"], stand(source, options["place"])
-    count = round(STEP_PERIODS / controller.spec.bandwidth_hz / controller.sample_time_s)
-    expected = expect(controller, draws, options, count)
-    return Stage(name=name, source=source, certificate=certificate, note=note, place=place, **expected)
+    place = options["place"]
+    required = certificate.requirements
+    return Stage(
+        name=name, source=source, requirements=required, certificate=certificate, note=note, place=place, **expected
+    )

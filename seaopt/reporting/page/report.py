@@ -17,6 +17,7 @@ from seaopt.errors import FileError, SeaoptError, require_type
 from seaopt.estimation import Diagnostics, Fit, Ranking, diagnose
 from seaopt.files import read_json, write_json, write_text
 from seaopt.formatting import format_count
+from seaopt.logs import Quality
 from seaopt.progress import Progress, count_off, ignore
 from seaopt.records import record
 from seaopt.reporting.comparison import fit_surveys, response_panels
@@ -34,6 +35,7 @@ from seaopt.reporting.figures.schedule import schedule_panels
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import render_parts, render_template
+from seaopt.reporting.responses import Responses
 from seaopt.reporting.sections import describe, summarise
 from seaopt.reporting.sections.data import Section
 from seaopt.reporting.sections.kinds.responses import compare_with_fit
@@ -55,6 +57,8 @@ Result = (
     | ScheduledController
     | LargeSignal
     | Frontier
+    | Quality
+    | Responses
 )
 PARTS = {
     "expectations": "What the problem file expects",
@@ -71,11 +75,16 @@ PARTS = {
     "contact": "Contact with an environment",
     "parameters": "Parameters",
     "logs": "Quality of the logs",
+    "responses": "Frequency responses",
+    "bringup": "Bring-up",
+    "acceptance": "On the machine",
     "findings": "Findings",
     "provenance": "Provenance",
 }
 # with figures as files
 FILED = ("controller", "schedule", "frontier", "fit", "ranking", "certificate", "amplitude", "contact")
+# Where results stand that have no figures here, by their names: those of the machine are made above this package.
+BESIDES = {"Quality": "logs", "Responses": "responses", "BringUp": "bringup", "Acceptance": "acceptance"}
 FIGURES_SCHEMA = "seaopt/figures/1"
 LAW_NAME = "force_law"  # of the C header that can be copied
 
@@ -96,6 +105,7 @@ class Material:
     large: tuple[LargeSignal, ...] = ()
     passivity: Passivity | None = None
     diagnostics: Diagnostics | None = None
+    besides: tuple[Any, ...] = ()
 
 
 KINDS: dict[str, type[Any]] = {  # of what may be given, those of which there is one at most
@@ -117,7 +127,7 @@ class Plate:
 
 
 def write_report(
-    results: Sequence[Result],
+    results: Sequence[Any],
     path: Path | str,
     *,
     title: str = "Series elastic actuator",
@@ -131,9 +141,9 @@ def write_report(
     Parameters
     ----------
     results : sequence of Fit, Ranking, Controller, ForceMPC, Certificate, Verification, StabilityMap, LargeSignal
-        And ScheduledController and Frontier. At most one of each, of LargeSignal any number; sections without a
-        result are left out. A fit that was not read from a file has a section of diagnostics. A certificate's
-        simulations need not be listed.
+        And ScheduledController, Frontier, Quality, Responses, BringUp, Acceptance. At most one of each, of LargeSignal
+        any number; sections without a result are left out. A fit that was not read from a file has a section of
+        diagnostics. A certificate's simulations need not be listed.
     path : path
         The page; figures go to the folder ``figures`` beside it, with a list of them; those of an earlier page of that
         name which this one does not have are removed.
@@ -171,12 +181,13 @@ def write_report(
     require_type(path, (str, Path), "path", "give the page to write")
     require_type(title, str, "title", "give the page's heading")
     for result in results:
-        require_type(
-            result,
-            get_args(Result),
-            "results",
-            "give what fit, tune, certify, verify or compare returned",
-        )
+        if type(result).__name__ not in BESIDES:
+            require_type(
+                result,
+                get_args(Result),
+                "results",
+                "give what fit, tune, certify, verify or compare returned",
+            )
     material, target = _sort_results(results), Path(path)
     plates = list(_list_plates(material))
     drawn: dict[str, list[dict[str, Any]]] = {}
@@ -207,7 +218,7 @@ def _list_figures(page: Path, figures: Sequence[Path]) -> None:
         write_json(contents, {"schema": FIGURES_SCHEMA, "figures": names})
 
 
-def _sort_results(results: Sequence[Result]) -> Material:
+def _sort_results(results: Sequence[Any]) -> Material:
     """Return the results by their kind, with what a certificate brings besides."""
     if not results:
         raise SeaoptError(
@@ -234,7 +245,8 @@ def _sort_results(results: Sequence[Result]) -> Material:
         by_kind = brought | by_kind
     if "fit" in by_kind and by_kind["fit"].minimum is not None:
         by_kind["diagnostics"] = diagnose(by_kind["fit"])
-    return Material(**by_kind, large=large)
+    besides = tuple(result for result in results if type(result).__name__ in BESIDES)
+    return Material(**by_kind, large=large, besides=besides)
 
 
 def _list_plates(material: Material) -> Iterator[Plate]:
@@ -353,9 +365,10 @@ def _render(
         certificate=certificate,
         # the certificate speaks of its own runs
         verification=None if certificate is not None and runs is certificate.runs else runs,
+        besides=material.besides,
         expectations=expectations,
     )
-    first = (fit, controller, certificate, runs)
+    first = (fit, controller, certificate, runs, *material.besides)
     results = (
         controller,
         material.schedule,
@@ -375,6 +388,11 @@ def _render(
     sections: list[Section] = [
         *describe_expectations(expectations),
         *(section for result in results if result is not None for section in describe(result)),
+        *(
+            replace(section, part=BESIDES[type(result).__name__])
+            for result in material.besides
+            for section in describe(result)
+        ),
         describe_provenance(experiments, files, command),
     ]
     described = render_parts(sections, PARTS)

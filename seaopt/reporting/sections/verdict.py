@@ -22,6 +22,7 @@ def judge_results(
     mpc: ForceMPC | None = None,
     certificate: Certificate | None = None,
     verification: Verification | None = None,
+    besides: Sequence[object] = (),
     expectations: Sequence[tuple[bool, str]] = (),
 ) -> list[Verdict]:
     """Return the verdict on each result that there is; a design on a fit that is not met is not met either.
@@ -30,6 +31,8 @@ def judge_results(
     ----------
     fit, controller, mpc, certificate, verification : optional
         Results, the later ones made with the earlier ones.
+    besides : sequence
+        Others that were made with them.
     expectations : sequence of (bool, str)
         Of a problem file: whether each is met, and what to say of it.
 
@@ -40,7 +43,7 @@ def judge_results(
     >>> [one.text for one in judge_results(controller=controller)]
     ['Controller: pid on F1, 30 Hz, every limit met']
     """
-    designs = (controller, mpc, certificate, verification)
+    designs = (controller, mpc, certificate, verification, *besides)
     judged = [verdict for design in designs if design is not None and (verdict := judge(design)) is not None]
     if fit is not None:
         judged = judged if fit.met else list(map(doubt_design, judged))

@@ -1,0 +1,92 @@
+"""A bring-up is read back from bringup.json without certifying, and a damaged file is refused."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import seaopt as so
+from seaopt.errors import FileError, SeaoptError
+from seaopt.files import read_json, seal, to_json, write_json
+from seaopt.machine import BringUp, write_bring_up
+from seaopt.machine.bringup.plan import BRINGUP_SCHEMA
+from tests.damage import damage
+
+
+@pytest.fixture(scope="module")
+def plan(controller):
+    plants, thor = {"stand": so.plants.high_impedance()}, so.plants.thor()
+    return so.bring_up(controller, plants, thor, samples=20, fractions=(0.5,), limits={"F1": 900.0})
+
+
+@pytest.fixture(scope="module")
+def laws(plan):
+    return {stage.name: stage.source for stage in plan.stages}
+
+
+@pytest.fixture(scope="module")
+def content(plan):
+    return json.loads(to_json(seal(plan.to_dict())))
+
+
+def test_a_bring_up_is_read_back(plan, laws, tmp_path, monkeypatch):
+    path = write_json(tmp_path / "bringup.json", plan.to_dict())
+    for module in ("certify", "expect", "tune_certified"):
+        monkeypatch.setattr(f"seaopt.machine.bringup.stages.{module}", None)  # nothing is planned again
+    again = BringUp.from_dict(read_json(path, BRINGUP_SCHEMA), laws)
+    assert again.met == plan.met and repr(again) == repr(plan)
+    for read, stage in zip(again.stages, plan.stages, strict=True):
+        assert read.certificate is None and read.requirements == stage.requirements
+        assert read.tracking == stage.tracking and read.step == stage.step and read.stop == stage.stop
+        assert read.excitation.lines.tolist() == stage.excitation.lines.tolist()
+        assert read.excitation.lasts_s == pytest.approx(stage.excitation.reference.size * 1e-3)
+
+
+def test_what_was_read_back_has_no_reference_to_write(plan, laws, content, tmp_path):
+    with pytest.raises(SeaoptError, match=r"reference\.csv of its stage"):
+        write_bring_up(BringUp.from_dict(content, laws), tmp_path)
+
+
+def test_a_bring_up_of_other_laws_is_refused(laws, content):
+    with pytest.raises(FileError, match=r"stage_1 is of law \w+, not \w+; plan the stages again"):
+        BringUp.from_dict(content, laws | {"stage_1": laws["full"]})
+    with pytest.raises(FileError, match="full has no law"):
+        BringUp.from_dict(content, {"stage_1": laws["stage_1"]})
+
+
+@pytest.mark.parametrize(
+    ("place", "key", "value", "words"),
+    [
+        ((), "met", False, "met is False"),
+        ((), "stages", [], "stages"),
+        (("stages", 0), "met", False, r"stages\.1\.met is False"),
+        (("stages", 0), "name", 3, r"stages\.1\.name"),
+        (("stages", 0), "bandwidth_hz", 16.0, r"stages\.1\.bandwidth_hz is 16"),
+        (("stages", 0), "channels", ["F1"], r"stages\.1\.channels"),
+        (("stages", 0), "rate_hz", 500.0, r"stages\.1\.rate_hz"),
+        (("stages", 0), "requirements", [], r"stages\.1\.requirements"),
+        (("stages", 0, "requirements", 0), "met", False, "met is True"),
+        (("stages", 0, "reference"), "amplitude", float("nan"), r"stages\.1\.reference\.amplitude"),
+        (("stages", 0, "reference"), "period_s", 4.0001, r"stages\.1\.reference\.(period_s|frequency_hz)"),
+        (("stages", 0, "reference"), "phases", 0, r"stages\.1\.reference\.phases"),
+        (("stages", 0, "reference"), "unit", "N m", r"stages\.1\.reference\.unit"),
+        (("stages", 0, "peaks"), "I", "large", r"stages\.1\.peaks\.I"),
+        (("stages", 0, "expected", "step"), "low", None, r"stages\.1\.expected\.step\.low"),
+    ],
+)
+def test_a_damaged_bring_up_is_refused(content, laws, place, key, value, words):
+    damaged, edited = damage(content, place, key, value)
+    with pytest.raises(FileError, match=words) as caught:
+        BringUp.from_dict(damaged, laws)
+    assert str(caught.value).startswith("bringup.json") and "\n" not in str(caught.value)
+    with pytest.raises(FileError, match="edited"):
+        BringUp.from_dict(edited, laws)
+
+
+@pytest.mark.parametrize("key", ["reference", "expected", "law", "requirements", "friction"])
+def test_a_bring_up_without_a_key_is_refused(content, laws, key):
+    stages = [{name: value for name, value in stage.items() if name != key} for stage in content["stages"]]
+    kept = {name: value for name, value in content.items() if name != "made_from"} | {"stages": stages}
+    with pytest.raises(FileError, match=f"{key}.*plan the stages again"):
+        BringUp.from_dict(kept, laws)
