@@ -212,7 +212,8 @@ class Controller(ClosesLoops, Result, Worded):
     @property
     def design_loop(self) -> MeasuredLoop:
         """The design plant's loop, as limits are judged on it."""
-        return self._add_friction(self.measure("design plant", self.achieved))
+        loop = self.measure("design plant", self.achieved)
+        return loop if self.design is None else self._add_friction(loop)
 
     def measure(self, name: str, figures: LoopFigures, port: PortFigures | None = None) -> MeasuredLoop:
         """Return a design plant's loop, as limits are judged on it.
@@ -238,10 +239,18 @@ class Controller(ClosesLoops, Result, Worded):
         )
 
     def _add_friction(self, loop: MeasuredLoop) -> MeasuredLoop:
-        """Return the design plant's loop with its friction margin, where it has friction."""
-        if self.friction is None or self.design is None:
-            return loop
-        return replace(loop, friction_slope=self.friction.least_slope, slope_unit=name_slope_unit(self.design[0]))
+        """Return the design plant's loop with its friction margin and that where it slides fast, if it has friction."""
+        assert self.design is not None
+        if self.friction is not None:
+            unit = name_slope_unit(self.design[0])
+            loop = replace(loop, friction_slope=self.friction.least_slope, slope_unit=unit)
+        return replace(loop, fast=self.measure_fast(*self.design))
+
+    def measure_fast(self, plant: Plant, params: ParameterSet) -> LoopFigures | None:
+        """Return the figures where a plant slides fast; None where no friction falls with the speed before."""
+        if not falls(plant, params):
+            return None
+        return Loop(plant=self.plant(slide_fast(plant), params), law=self.law).figures()
 
     @property
     def prefilter(self) -> Prefilter | None:
@@ -289,10 +298,8 @@ class Controller(ClosesLoops, Result, Worded):
         None where no friction falls with the speed, of a loop that does not come to -3 dB, and of a measured design
         plant.
         """
-        if self.design is None or not falls(*self.design):
-            return None
-        plant, params = self.design
-        return Loop(plant=self.plant(slide_fast(plant), params), law=self.law).figures().bandwidth_hz
+        fast = None if self.design is None else self.measure_fast(*self.design)
+        return None if fast is None else fast.bandwidth_hz
 
     @property
     def designs_on_response(self) -> bool:

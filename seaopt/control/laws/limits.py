@@ -36,7 +36,7 @@ INTEGRAL_RAD_S = 2 * math.pi * 0.05  # k_i/(1 + k_p) at least, so that an integr
 STEADY = 0.02  # of a step of the reference: how far the force may be off in the end
 STEADY_PERIODS = 80.0  # of the bandwidth, after which that end begins
 
-OTHER_NOISE = "max_other_noise_gain"
+OTHER_NOISE, FAST_BANDWIDTH = "max_other_noise_gain", "min_bandwidth_sliding_fast_hz"
 
 Sense = Literal["at most", "at least", "equal to"]
 Symbol = Literal["≤", "≥", "="]
@@ -66,6 +66,7 @@ class MeasuredLoop:
     # none is asked about, and its unit, empty without friction
     friction_slope: float = math.inf
     slope_unit: str = ""
+    fast: LoopFigures | None = None  # where it slides fast, of a plant whose friction falls with the speed before
     gain_unit: str = LINEAR.gain  # of what the law gives over what it measures: N/N, N m/(N m), N m/rad
     other_gain_unit: str = ""  # the same of what it reads besides, where that is known
 
@@ -132,6 +133,8 @@ class Limit:
     bandwidth_divisor: float | None = None
     # of a limit of the design plant: where friction sticks it holds there too, not on the sliding plant alone
     stuck_too: bool = False
+    # of a limit of the design plant: it is asked where that slides fast, not where its friction falls the most
+    of_fast: bool = False
     allowed: float | None = None  # what is always allowed, of a limit whose field says where it holds, or that has none
     has_field: bool = True  # of the specification; without one the limit always holds
     # above, below: ends, exclusive, of what may be asked; `above` is None where the specification has its own check
@@ -221,6 +224,13 @@ class Limit:
         return value / allowed if self.sense == "at most" else allowed / max(value, 1e-12)
 
 
+def _find_fast_bandwidth(loop: MeasuredLoop) -> float:
+    """Return the bandwidth where the plant slides fast; where its friction does not fall, as it slides at all."""
+    figures = loop.figures if loop.fast is None else loop.fast
+    reached = math.inf if figures.bandwidth_hz is None else figures.bandwidth_hz
+    return reached if figures.stable else 0.0
+
+
 def _port(loop: MeasuredLoop) -> PortFigures:
     assert loop.port is not None, "a passive band is judged on the port's figures"
     return loop.port
@@ -304,6 +314,16 @@ LIMITS = (
         ),
         meaning="lowest frequency at which |F/F_ref| is 3 dB below its value at 0 Hz, met to 0.5 %",
         remedy="ask for the largest bandwidth that the result names",
+    ),
+    Limit(
+        name=FAST_BANDWIDTH, label="bandwidth, sliding fast", figure=_find_fast_bandwidth,
+        sense="at least", scope="design plant", unit="Hz", of_fast=True, tolerance=BANDWIDTH_TOLERANCE, reserve="curve",
+        curve=LimitCurve(
+            of="P C_r", level=lambda _: HALF_POWER, until_hz=lambda allowed, _: allowed, floor=True,
+        ),
+        meaning="the bandwidth where friction that falls with the speed (Stribeck's) falls no more; bandwidth_hz is "
+        "placed where it falls the steepest, which no motion keeps to",
+        remedy="ask for a higher bandwidth_hz", eased_by=("max_sensitivity", "max_noise_gain"),
     ),
     Limit(
         name="shoulder_hz", has_field=False, label="|F/F_ref| again above -3 dB at",

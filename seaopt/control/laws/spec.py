@@ -112,6 +112,7 @@ class ControllerSpec(LoopSpec):
     min_filter_samples: Level = _limit("min_filter_samples")
     min_friction_margin: Level = _limit("min_friction_margin")
     min_sensitivity_bandwidth_hz: Level = _limit("min_sensitivity_bandwidth_hz")
+    min_bandwidth_sliding_fast_hz: Level = _limit("min_bandwidth_sliding_fast_hz")
     passive_band_hz: tuple[float, float] | None = _limit("passive_band_hz")
     objective: Literal["disturbance", "noise"] = option(
         "What is sought among the laws that keep the limits: the least integral over log-frequency of |S| "
@@ -280,6 +281,8 @@ class ControllerSpec(LoopSpec):
         values["prefilter"] = self.reference_filter
         if self.bandwidth_tolerance == BANDWIDTH_TOLERANCE:
             del values["bandwidth_tolerance"]  # stands in no file of a law that was tuned
+        if self.min_bandwidth_sliding_fast_hz is None:
+            del values["min_bandwidth_sliding_fast_hz"]  # stands in no file of a plant without such friction
         if self.delay_samples is None:
             del values["delay_samples"]
             values["compute_delay_samples"] = self.loop_delay_samples

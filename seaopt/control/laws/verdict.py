@@ -9,7 +9,7 @@ from itertools import accumulate
 import numpy as np
 
 from seaopt.control.laws.delay import LoopSpec
-from seaopt.control.laws.limits import BY_NAME, LIFTABLE, OTHER_NOISE, Limit, MeasuredLoop, Scope, Sense
+from seaopt.control.laws.limits import BY_NAME, FAST_BANDWIDTH, LIFTABLE, OTHER_NOISE, Limit, MeasuredLoop, Scope, Sense
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.measured.loop import DiscLoop
@@ -239,7 +239,10 @@ class DesignFigure:
 
 def list_design_figures(spec: ControllerSpec, design: MeasuredLoop) -> list[DesignFigure]:
     """Return each limit of one loop's figures; of friction and of further signals only where there are, or one asks."""
-    present = {"min_friction_margin": design.slope_unit != "", OTHER_NOISE: design.figures.other_noise_gains != ()}
+    present = {
+        "min_friction_margin": design.slope_unit != "", OTHER_NOISE: design.figures.other_noise_gains != (),
+        FAST_BANDWIDTH: design.fast is not None,
+    }  # fmt: skip
     rows: list[DesignFigure] = []
     for limit in spec.limits:
         allowed = spec.allowed(limit)

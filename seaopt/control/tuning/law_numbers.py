@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.control.laws.limits import INTEGRAL_RAD_S
+from seaopt.control.laws.spec import ControllerSpec
+from seaopt.control.laws.structures import DisturbanceObserver, Gains, InnerLoop, Nominal, Notch, Prefilter, SpeedLoop
 
 SLOWEST_SPEED_RATE = 4.0 * INTEGRAL_RAD_S  # 1/T_v, rad/s, of a speed loop that integrates
 
@@ -24,8 +26,40 @@ def least_integral_rate(x: LawNumbers) -> float:
     return INTEGRAL_RAD_S / (1.0 - INTEGRAL_RAD_S / SLOWEST_SPEED_RATE) if x[SPEED_RATE] > 0.0 else INTEGRAL_RAD_S
 
 
+def make_gains(
+    spec: ControllerSpec, x: LawNumbers, k_ff: float, speed_loop: SpeedLoop | None, nominal: Nominal | None
+) -> Gains:
+    """Return the gains of numbers. `k_ff` is 1/P(0), `nominal` an observer's nominal plant."""
+    ts, notch, low_pass = spec.sample_time_s, None, spec.reference_filter
+    if spec.notch is not None:
+        centre = float(np.arctan(x[NOTCH_W]) / (np.pi * ts))
+        notch = Notch(frequency_hz=centre, width=float(x[NOTCH_WIDTH]), depth=float(x[NOTCH_DEPTH]))
+    if low_pass is not None:
+        damping = float(x[DAMPING]) if low_pass.is_second_order else None
+        corner = float(np.arctan(x[PREFILTER_W]) / (np.pi * ts))
+        low_pass = Prefilter(order=low_pass.order, corner_hz=corner, damping=damping)
+    k_p, k_d = float(x[K_P]), float(x[K_D])
+    whole = spec.reference_weights != "measurement"
+    inner = None
+    if speed_loop is not None:
+        T_v = 1.0 / float(x[SPEED_RATE]) if x[SPEED_RATE] > 0.0 else np.inf
+        inner = InnerLoop(k_v=float(x[K_V]), T_v=T_v, k_ff=k_ff, speed=speed_loop)
+    return Gains(
+        k_p=k_p,
+        k_i=float(x[K_I]),
+        k_d=k_d,
+        T_f=float(x[T_F]),
+        k_r=k_p - float(x[W_R]) + (k_ff if inner is None else 0.0),
+        c=1.0 - float(x[W_C]) / k_d if k_d > 0.0 else float(whole),
+        notch=notch,
+        inner=inner,
+        prefilter=low_pass,
+        observer=None if nominal is None else DisturbanceObserver(nominal=nominal, T_q=float(x[T_Q])),
+    )
+
+
 def read_numbers(gains: Mapping[str, float], k_ff: float, ts: float) -> LawNumbers:
-    """Return the numbers of gains by name, the inverse of `Task.gains`; those that a law does not have are ones. `k_ff`
+    """Return the numbers of gains by name, the inverse of `make_gains`; those that a law does not have are ones. `k_ff`
     is 1/P(0).
     """
     x = np.ones(14)

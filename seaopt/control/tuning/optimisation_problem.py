@@ -46,21 +46,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.laws.limits import BY_NAME, LIMITS, STEADY, STEADY_PERIODS, MeasuredLoop, Scope
+from seaopt.control.laws.limits import BY_NAME, FAST_BANDWIDTH, LIMITS, STEADY, STEADY_PERIODS, MeasuredLoop, Scope
 from seaopt.control.laws.passivity import measure_port
 from seaopt.control.laws.spec import HIGHEST_CORNER, ControllerSpec
-from seaopt.control.laws.structures import (
-    OBJECTIVE_HZ,
-    DisturbanceObserver,
-    Gains,
-    InnerLoop,
-    LawTerms,
-    Nominal,
-    Notch,
-    Prefilter,
-    SpeedLoop,
-    evaluate_terms,
-)
+from seaopt.control.laws.structures import OBJECTIVE_HZ, Gains, LawTerms, Nominal, SpeedLoop, evaluate_terms
 from seaopt.control.laws.verdict import list_broken_limits
 from seaopt.control.loops.absolute_stability import SIMPLEST, FrictionMargin, friction_margin
 from seaopt.control.loops.compensation.link_feedforward import LinkPath
@@ -108,6 +97,7 @@ from seaopt.control.tuning.law_numbers import (
     LawNumbers,
     LawsNumbers,
     least_integral_rate,
+    make_gains,
     warp_frequency,
 )
 from seaopt.plants import CompletedParameters, Plant
@@ -143,7 +133,8 @@ class Task:
     the link forward. `models` are the plants that are sampled; None where one is measured. With `moved` links the outer
     loop is closed around them, but for what is asked of the design plant alone, which is asked of the force law.
     `eased` are factors by which more of a limit may be used while a law is looked for, by its name
-    (`seaopt.control.tuning.solution`); and unless it `settles`, any part of a step may be left to the integral.
+    (`seaopt.control.tuning.solution`); and unless it `settles`, any part of a step may be left to the integral. `fast`
+    is which of the design states is the plant as it slides fast, where a bandwidth is asked for there.
     """
 
     spec: ControllerSpec
@@ -161,6 +152,7 @@ class Task:
     moved: MovedLinks | None = None
     eased: Mapping[str, float] = field(default_factory=dict[str, float])
     settles: bool = True
+    fast: int | None = None
     slowest_observer_s: float = 30.0  # where the objective begins, 0.1 Hz, Q is 0.003: it does nothing
 
     @property
@@ -181,7 +173,9 @@ class Task:
         imposed = [name for name in CURVES if self.spec.level(name) is not None]
         if self.spec.objective == "noise" and NOISE not in imposed:
             imposed.append(NOISE)
-        return tuple(name for name in imposed if CURVES[name].of != "C_v" or self.speed_loop is not None)
+        missing = {FAST_BANDWIDTH} if self.fast is None else set[str]()
+        missing |= set() if self.speed_loop is not None else {name for name in imposed if CURVES[name].of == "C_v"}
+        return tuple(name for name in imposed if name not in missing)
 
     @property
     def asks_margin(self) -> bool:
@@ -291,32 +285,7 @@ class Task:
 
     def gains(self, x: LawNumbers) -> Gains:
         """Return a vector's numbers by name."""
-        ts, notch, low_pass = self.spec.sample_time_s, None, self.spec.reference_filter
-        if self.spec.notch is not None:
-            centre = float(np.arctan(x[NOTCH_W]) / (np.pi * ts))
-            notch = Notch(frequency_hz=centre, width=float(x[NOTCH_WIDTH]), depth=float(x[NOTCH_DEPTH]))
-        if low_pass is not None:
-            damping = float(x[DAMPING]) if low_pass.is_second_order else None
-            corner = float(np.arctan(x[PREFILTER_W]) / (np.pi * ts))
-            low_pass = Prefilter(order=low_pass.order, corner_hz=corner, damping=damping)
-        k_p, k_d = float(x[K_P]), float(x[K_D])
-        whole = self.spec.reference_weights != "measurement"
-        inner = None
-        if self.speed_loop is not None:
-            T_v = 1.0 / float(x[SPEED_RATE]) if x[SPEED_RATE] > 0.0 else np.inf
-            inner = InnerLoop(k_v=float(x[K_V]), T_v=T_v, k_ff=self.k_ff, speed=self.speed_loop)
-        return Gains(
-            k_p=k_p,
-            k_i=float(x[K_I]),
-            k_d=k_d,
-            T_f=float(x[T_F]),
-            k_r=k_p - float(x[W_R]) + (self.k_ff if inner is None else 0.0),
-            c=1.0 - float(x[W_C]) / k_d if k_d > 0.0 else float(whole),
-            notch=notch,
-            inner=inner,
-            prefilter=low_pass,
-            observer=None if self.nominal is None else DisturbanceObserver(nominal=self.nominal, T_q=float(x[T_Q])),
-        )
+        return make_gains(self.spec, x, self.k_ff, self.speed_loop, self.nominal)
 
     def enclosed(self, outer: OuterLoop, per_effort: float) -> Task:
         """Return the task with an outer loop around the plants whose links move. `per_effort` is the command's."""
@@ -438,7 +407,9 @@ class Task:
             curves = self.curves(self.design_limits(row), grid, position, law)
             curves |= self.port_usage(grid, law) if row == 0 else {}
             for name, curve in curves.items():
-                rows.setdefault(name, []).append(curve)
+                before = rows.setdefault(name, [])
+                before += [np.zeros_like(curve)] * (position - len(before))  # of plants that it is not for
+                before.append(curve)
         everywhere = self.curves(SCOPES["every plant"], grid, slice(None), law) | use_friction(grid, law)
         return everywhere | {name: np.array(usage) for name, usage in rows.items()}
 
@@ -481,10 +452,13 @@ class Task:
         return 0.0 if ends[0] is None else ends[0], np.inf if ends[1] is None else ends[1]
 
     def design_limits(self, row: int) -> tuple[str, ...]:
-        """Return the limits that a plant keeps as the design plant, sliding or stuck; none if it is another."""
+        """Return the limits that a plant keeps as the design plant, sliding, stuck or fast; none if it is another."""
         if row >= self.design_states:
             return ()
-        return tuple(name for name in SCOPES["design plant"] if row == 0 or BY_NAME[name].stuck_too)
+        limits = (BY_NAME[name] for name in SCOPES["design plant"])
+        return tuple(
+            limit.name for limit in limits if limit.stuck_too or (row == self.fast if limit.of_fast else row == 0)
+        )
 
     def port_usage(self, grid: Grid, law: LawResponse) -> dict[str, np.ndarray]:
         """Return the usage of the passive band, where one is asked for."""
@@ -530,10 +504,12 @@ class Task:
         if self.asks_margin:
             margins = zip(self.frictions, self.find_margins(law), strict=True)
             slopes = {sliding.plant: margin.least_slope for sliding, margin in margins}
+        figures = [self.measure_figures(law, i) for i in range(len(self.names))]
         return [
             MeasuredLoop(
                 name=name,
-                figures=self.measure_figures(law, i),
+                figures=figures[i],
+                fast=None if i or self.fast is None else figures[self.fast],
                 port=None if i else port,
                 filter_samples=filter_samples,
                 integral_rad_s=integral_rad_s,

@@ -24,7 +24,7 @@ from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import place_drive_delay, settle_delays, take_own_delays
 from seaopt.control.laws.friction import find_friction_margin
-from seaopt.control.laws.limits import MeasuredLoop
+from seaopt.control.laws.limits import FAST_BANDWIDTH, MeasuredLoop
 from seaopt.control.laws.spec import ControllerSpec
 from seaopt.control.laws.structures import CASCADE, CUSTOM, DisturbanceObserver, Nominal, SpeedLoop
 from seaopt.control.laws.verdict import PossibleBandwidths, explain_broken, judge_all, list_active, list_broken
@@ -66,10 +66,13 @@ from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.friction import (
+    FAST,
     SLIDING,
+    falls,
     find_dry_friction,
     friction_slopes,
     friction_states,
+    slide_fast,
     split_friction,
     take_sliding,
 )
@@ -274,11 +277,15 @@ def make_task(
         design, signals = link.see(design), (*signals, link.measured)
     varied = {parameter for draw in draws for parameter in draw}
     models: dict[str, tuple[Plant, CompletedParameters]] = {}
-    design_states = 1 if first else len(split_friction({"": design}, values, varied))
+    design_states, fast = 1 if first else len(split_friction({"": design}, values, varied)), None
+    if not first and spec.level(FAST_BANDWIDTH) is not None and falls(design, values):
+        fast, design_states = design_states, design_states + 1
     whole: dict[Plant, Plant] = {}  # the plant with its friction, of one that slides
     for name, (model, params) in named.items():
         completed = model.complete(params)
         variants = split_friction({name: model}, completed, varied)
+        if not models and fast is not None:
+            variants[f"{name} {FAST}"] = slide_fast(model)
         models |= {state: (variant, variant.complete(completed)) for state, variant in variants.items()}
         if model not in variants.values():  # it has friction, and is there twice or more
             whole[friction_states(model)[SLIDING]] = model
@@ -310,6 +317,7 @@ def make_task(
         nominal=nominal,
         port=port,
         design_states=design_states,
+        fast=fast,
         signals=signals,
         frictions=_find_friction(spec, signals, [pair for _, pair in pairs], plants, whole, gain, len(first)),
         further=further,
@@ -391,8 +399,9 @@ def _find_nominal(
 
 def _check_measured_design(spec: ControllerSpec) -> None:
     """Refuse what takes a model of the design plant, where that is a measured response."""
-    if spec.passive_band_hz is not None or spec.level(FRICTION) is not None:
-        name = "passive_band_hz" if spec.passive_band_hz is not None else FRICTION
+    asked = [name for name in (FRICTION, FAST_BANDWIDTH) if spec.level(name) is not None]
+    if spec.passive_band_hz is not None or asked:
+        name = "passive_band_hz" if spec.passive_band_hz is not None else asked[0]
         raise ControlError(
             f"{name} takes a model of the design plant, and that is a measured response; leave it out, or design on a "
             "model and name the response in robust_to"

@@ -208,7 +208,8 @@ def design_requirements(
     if band is not None and controller.design is not None:
         port_plant = port_of(states[state], controller.delay(values), controller.signals, controller.command.per_effort)
         port = measure_port(port_plant, controller.law, controller.compute_delay_samples, band)
-    rows = _judge(controller, controller.measure("", achieved, port), "design plant", Spot(DESIGN_PLANT, state))
+    sliding = replace(controller.measure("", achieved, port), fast=controller.measure_fast(plant, values))
+    rows = _judge(controller, sliding, "design plant", Spot(DESIGN_PLANT, state))
     for other, loop in stuck:
         measured = controller.measure("", loop)
         rows += _judge(controller, measured, "design plant", Spot(DESIGN_PLANT, other), stuck=True)

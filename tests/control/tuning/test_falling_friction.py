@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -133,6 +134,62 @@ def test_the_sliding_bandwidth_is_a_range_from_fast_to_the_steepest_fall(plant, 
     verdict, *_ = repr(tuned).splitlines()
     assert f"{coulomb:.3g} to 20 Hz sliding and" in verdict
     assert f"{coulomb:.4g} Hz where it slides fast" in " ".join(repr(tuned).split())
+
+
+def respond_fast(law, params, f):
+    """Return F/F_ref at frequencies where the slope of friction is zero, written out for this test."""
+    mass = Mass.of({name: params[name].value for name in params})
+    a = np.array([[0.0, 1.0], [-mass.k / mass.m, -mass.b / mass.m]])
+    whole = expm(np.block([[a, np.array([[0.0], [1.0 / mass.m]])], [np.zeros((1, 3))]]) * 1e-3)
+    z = np.exp(2j * np.pi * f * 1e-3)
+    force = np.array([mass.k * np.linalg.solve(each * np.eye(2) - whole[:2, :2], whole[:2, 2])[0] for each in z])
+    ahead, back = (
+        np.polynomial.polynomial.polyval(1.0 / z, path["num"]) / np.polynomial.polynomial.polyval(1.0 / z, path["den"])
+        for path in (law["reference"], law["measurement"])
+    )
+    force = force * z**-2.0
+    return force * ahead / (1.0 + force * back)
+
+
+def test_a_met_bandwidth_says_that_nothing_is_asked_sliding_fast(tuned):
+    """The design plant slides where its friction falls the steepest; what is left fast is a row, asked for or not."""
+    fast = tuned.bandwidth_sliding_fast_hz
+    verdict, *_ = repr(tuned).split("\n\n")
+    assert tuned.met and f"none asks for more than {fast:.4g} Hz sliding fast" in " ".join(verdict.split())
+    assert "min_bandwidth_sliding_fast_hz = 20 in [controller]" in " ".join(verdict.split())
+    assert re.search(rf"bandwidth, sliding fast +{fast:.4g} Hz +not required", repr(tuned))
+    assert "min_bandwidth_sliding_fast_hz" not in tuned.active_constraints
+
+
+def test_a_bandwidth_that_is_asked_sliding_fast_is_had_there_or_is_not_met(plant):
+    """At 26 Hz the tuner keeps 18 Hz there with every other limit; at 20 Hz no law does, and it says which would."""
+    params = falling(plant, 35.0, 0.02)
+    asked = replace(SPEC, min_bandwidth_sliding_fast_hz=18.0, bandwidth_hz=26.0)
+    controller = so.tune(plant, params, asked)
+    f = np.geomspace(0.1, 60.0, 4000)
+    size = np.abs(respond_fast(controller.to_dict(), params, f))
+    fast = f[np.argmax(size < np.sqrt(0.5))]
+    assert controller.met and controller.achieved.bandwidth_hz == pytest.approx(26.0, rel=5e-3)
+    assert fast == pytest.approx(controller.bandwidth_sliding_fast_hz, rel=2e-3)
+    assert fast >= 18.0 * (1.0 - 5e-3)
+    certificate = so.certify(controller, {"stand": plant}, params, samples=1, simulations=False)
+    (row,) = (row for row in certificate.requirements if row.name == "min_bandwidth_sliding_fast_hz")
+    assert row.met and row.sense == "≥" and row.limit == 18.0 and row.unit == "Hz"
+    assert row.value == pytest.approx(controller.bandwidth_sliding_fast_hz, rel=1e-9)
+    given = replace(controller, spec=replace(asked, min_bandwidth_sliding_fast_hz=24.0)).to_dict()
+    read = so.Controller.from_dict(json.loads(to_json(given)), plant, params)
+    assert not read.met and read.active_constraints == ("min_bandwidth_sliding_fast_hz",)
+    low = so.tune(plant, params, replace(asked, bandwidth_hz=20.0))
+    assert not low.met and 20.0 < min(low.possible.nearest_hz) <= 26.0
+    certificate = so.certify(
+        replace(low, spec=replace(low.spec, min_bandwidth_sliding_fast_hz=19.0)),
+        {"stand": plant},
+        params,
+        samples=1,
+        simulations=False,
+    )
+    rows = {row.name: row for row in certificate.requirements}
+    assert not rows["min_bandwidth_sliding_fast_hz"].met
 
 
 def test_a_file_states_the_range_that_its_law_has(plant, tuned):

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 from seaopt.control import Controller, LoopFigures
 from seaopt.control.laws.command import describe_cascade, name_gain_units
+from seaopt.control.laws.limits import BANDWIDTH_TOLERANCE, FAST_BANDWIDTH
 from seaopt.control.laws.verdict import advise_easing, join_limits, list_design_figures
 from seaopt.control.loops.law import describe_integrators
 from seaopt.formatting import MISSING, format_band, format_count, format_figure, format_number
@@ -23,7 +24,14 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
     name = f"Controller: {controller.structure} on {spec.regulated}, {say_bandwidths(controller, spec.bandwidth_hz)}"
     if controller.met:
         on = " on measured points" if controller.design is None else ""
-        return Verdict(met=True, text=f"{name}, every limit met{on}")
+        fast = _find_unasked(controller)
+        if fast is None:
+            return Verdict(met=True, text=f"{name}, every limit met{on}")
+        return Verdict(
+            met=True,
+            text=f"{name}, every limit met; none asks for more than {format_figure(fast, 'Hz')} sliding fast",
+            next=(Step(text=f"to ask for it there, too: {FAST_BANDWIDTH} = {spec.bandwidth_hz:g} in [controller]"),),
+        )
     blocked = controller.blocked_by or (join_limits(controller.binding),)
     reasons = [Reason(what=text) for text in blocked]
     return Verdict(
@@ -32,6 +40,13 @@ def judge(controller: Controller, commands: Commands) -> Verdict:
         reasons=tuple(reasons),
         next=_advise_bandwidth(controller, commands),
     )
+
+
+def _find_unasked(controller: Controller) -> float | None:
+    """Return the bandwidth where it slides fast, if that is below the one asked and no limit is on it."""
+    fast, asked_hz = _measure_fast(controller), controller.spec.bandwidth_hz
+    short = fast is not None and fast < asked_hz * (1.0 - BANDWIDTH_TOLERANCE)
+    return fast if short and controller.spec.level(FAST_BANDWIDTH) is None else None
 
 
 def say_bandwidths(controller: Controller, bandwidth_hz: float | None) -> str:
@@ -158,19 +173,18 @@ def describe(controller: Controller) -> list[Section]:
 
 def list_achieved(controller: Controller) -> list[tuple[str, str, str]]:
     """Return the figures of the design plant: what each is, what was achieved, what was asked."""
-    a = controller.achieved
+    a, a_range = controller.achieved, controller.design_loop.fast is not None
     rows, stuck = list[tuple[str, str, str]](), _measure_stuck(controller)
     for row in list_design_figures(controller.spec, controller.design_loop):
-        two = row.limit.name == "bandwidth_hz" and show_stuck_bandwidth(controller)
-        fast = _measure_fast(controller) if row.limit.name == "bandwidth_hz" else None
-        label = f"{row.limit.label}, sliding" if two or fast is not None else row.limit.label
-        rows.append((label, format_figure(row.value, row.unit), row.allowed_text))
-        if fast is not None:
-            rows.append((f"{row.limit.label}, sliding fast", format_figure(fast, "Hz"), ""))
-        if two:
-            rows += [
-                (f"{row.limit.label},{state}", format_figure(each.bandwidth_hz, "Hz"), "") for state, each in stuck
-            ]
+        limit, asked = row.limit, row.allowed_text
+        label = limit.label
+        if limit.name == "bandwidth_hz" and (show_stuck_bandwidth(controller) or a_range):
+            label = f"{label}, sliding"
+        if limit.name == FAST_BANDWIDTH:
+            asked = asked or "not required"
+        rows.append((label, format_figure(row.value, row.unit), asked))
+        if limit.name == (FAST_BANDWIDTH if a_range else "bandwidth_hz") and show_stuck_bandwidth(controller):
+            rows += [(f"bandwidth,{state}", format_figure(each.bandwidth_hz, "Hz"), "") for state, each in stuck]
     if controller.prefilter is not None:
         rows.append(("bandwidth without prefilter", format_figure(controller.bandwidth_without_prefilter_hz, "Hz"), ""))
     return [
