@@ -229,7 +229,7 @@ def export_all(compiler, parts, controller, folder, monkeypatch):
     return play
 
 
-@pytest.mark.parametrize("count", [20, pytest.param(3 * STRUCTURES, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20, pytest.param(667, marks=pytest.mark.slow)])
 def test_python_compiled_loop_and_c_give_the_same_commands(count, compiler, tuned, tmp_path, monkeypatch):
     rng, plant = np.random.default_rng(count), make_plant()
     parts = [draw_part(number % STRUCTURES, rng) for number in range(count)]
