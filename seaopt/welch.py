@@ -14,6 +14,8 @@ from jaxtyping import Complex, Float
 
 INDEPENDENT = 0.947  # averages that a window counts as, half of which is the next one's (Welch 1967, Hann)
 MEAN_SQUARE = 0.375  # of the taper
+NEAR_PEAK = 0.89  # of a peak's height: 1 dB below it
+FEWEST_LINES = 8  # for a curve through a peak
 Start = TypeVar("Start")
 
 
@@ -58,3 +60,23 @@ def coherence(
 ) -> Float[np.ndarray, "*shape"]:
     """Return the squared coherence of each line, of the averaged cross-spectrum and powers."""
     return square(cross) / np.maximum(first * second, 1e-300)
+
+
+def find_top(
+    f: Float[np.ndarray, " m"], size: Float[np.ndarray, " m"], std: Float[np.ndarray, " m"]
+) -> tuple[float, float]:
+    """Return where a response is largest, and how large: the top of a cubic through the lines within 1 dB of the
+    largest, in logarithms, or that line where there are too few. `size` is its size at lines, `std` relative.
+    """
+    top = int(np.argmax(size))
+    at, height = float(f[top]), float(size[top])
+    first = top - int(np.argmax(np.append(size[top::-1] < NEAR_PEAK * size[top], True)))
+    last = top + int(np.argmax(np.append(size[top:] < NEAR_PEAK * size[top], True)))
+    near = slice(max(first + 1, 0), last)
+    if last - near.start < FEWEST_LINES:
+        return at, height
+    x = np.log(f[near] / at)
+    curve = np.polyfit(x, np.log(size[near]), 3, w=1.0 / np.maximum(std[near], 1e-9))
+    dense = np.linspace(x[0], x[-1], 401)
+    best = int(np.argmax(np.polyval(curve, dense)))
+    return at * float(np.exp(dense[best])), float(np.exp(np.polyval(curve, dense[best])))

@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 from jaxtyping import Bool
 
+from seaopt import welch
 from seaopt.codec import to_content
 from seaopt.errors import LogError
 from seaopt.frequency.response import ComplexLines, FrequencyResponse, Lines, find_band, h1
@@ -37,7 +38,6 @@ from seaopt.units import mechanics_of
 
 MIN_RESPONSE_SAMPLES = 256  # samples
 SMOOTH = 5  # lines of which the median coherence decides where a band ends
-NEAR_PEAK = 0.89  # of the peak's height: 1 dB below it
 ResponseFunction = Callable[[Any], Any]
 
 
@@ -329,26 +329,16 @@ def _pair(plant: Plant, log: Log, clock: Clock, source: str, output: str, stretc
 
 
 def _peak(estimate: FrequencyResponse, band: tuple[float, float] | None) -> Peak | None:
-    """Return the top of a cubic through the lines within 1 dB of the largest, in logarithms; or that line."""
+    """Return the top of the lines of a band; None where the response is largest at an end of it."""
     if band is None:
         return None
     inside = np.flatnonzero((estimate.frequency_hz >= band[0]) & (estimate.frequency_hz <= band[1]))
-    size = np.abs(estimate.response[inside])
+    size, std = np.abs(estimate.response[inside]), estimate.relative_std[inside]
     top = int(np.argmax(size))
     if top in (0, size.size - 1):
         return None
-    first = top - int(np.argmax(np.append(size[top::-1] < NEAR_PEAK * size[top], True)))
-    last = top + int(np.argmax(np.append(size[top:] < NEAR_PEAK * size[top], True)))
-    near = inside[max(first + 1, 0) : last]
-    f, std = estimate.frequency_hz, estimate.relative_std
-    at, height = float(f[inside[top]]), float(size[top])
-    if near.size >= MIN_LINES:
-        x = np.log(f[near] / at)
-        curve = np.polyfit(x, np.log(np.abs(estimate.response[near])), 3, w=1.0 / np.maximum(std[near], 1e-9))
-        dense = np.linspace(x[0], x[-1], 401)
-        best = int(np.argmax(np.polyval(curve, dense)))
-        at, height = at * float(np.exp(dense[best])), float(np.exp(np.polyval(curve, dense[best])))
-    return Peak(frequency_hz=at, magnitude=height, std=float(std[inside[top]]) * height)
+    at, height = welch.find_top(estimate.frequency_hz[inside], size, std)
+    return Peak(frequency_hz=at, magnitude=height, std=float(std[top]) * height)
 
 
 def _is_form(plant: Plant, spring: SeriesSpring, values: CompletedParameters, pair: Pair) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.signal
 
 import seaopt as so
 from seaopt.logs import assess_quality
@@ -72,3 +73,37 @@ def test_of_one_sine_it_is_not_said_that_inertia_hardly_matters():
     log = so.Log.from_arrays(time=t, I=u, tau_s=torque, theta_m=theta + 1e-4 * rng.normal(size=t.size))
     (finding,) = assess_quality(log, inputs=["I"]).of("excitation")
     assert "little effect" not in finding.sentence and "only a fit tells" in finding.sentence
+
+
+def answer_of_a_mode(kind, seconds, damping, natural_hz, rate=1000.0):
+    """Return a log of a drive from 0.2 to 40 Hz through a mode, by its exact discretisation, with noise and 3 gaps."""
+    rng, n = np.random.default_rng(0), round(seconds * rate)
+    t, omega = np.arange(n) / rate, 2.0 * np.pi * natural_hz
+    if kind == "noise":
+        u = rng.normal(size=n)
+    elif kind == "multisine":
+        lines, base = np.arange(1, 160), np.arange(4000) / rate
+        wave = np.cos(2.0 * np.pi * np.outer(lines, base) / 4.0 + rng.uniform(0.0, 2.0 * np.pi, (lines.size, 1)))
+        u = np.resize(np.sum(wave, axis=0), n)
+    else:
+        u = scipy.signal.chirp(t, 0.2, seconds, 40.0, kind, phi=-90)
+    top, below, _ = scipy.signal.cont2discrete(([omega**2], [1.0, 2.0 * damping * omega, omega**2]), 1.0 / rate)
+    y = scipy.signal.lfilter(top.ravel(), below, u)
+    y += 0.02 * np.std(y) * rng.normal(size=n)
+    kept = np.delete(np.arange(n), rng.choice(n, 3, replace=False))
+    return so.Log.from_arrays(time=t[kept], I=u[kept], F1=y[kept])
+
+
+@pytest.mark.parametrize("damping", [0.03, 0.1, 0.2])
+@pytest.mark.parametrize("natural_hz", [8.5, 20.0])
+@pytest.mark.parametrize(
+    ("kind", "seconds"),
+    [
+        *(("logarithmic", seconds) for seconds in (12.0, 30.0, 60.0)),
+        *(("linear", 30.0), ("noise", 60.0), ("multisine", 30.0)),
+    ],
+)
+def test_the_peak_of_a_mode_is_where_its_closed_form_has_it(kind, seconds, damping, natural_hz):
+    """To 3 %: 6.8 Hz was said of 8.49 Hz under a chirp of 30 s, and of others up to 26 % off."""
+    found = answer_of_a_mode(kind, seconds, damping, natural_hz).quality.excitation["I"].peak_hz
+    assert found == pytest.approx(natural_hz * np.sqrt(1.0 - 2.0 * damping**2), rel=0.03)

@@ -6,14 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from seaopt import welch
 from seaopt.codec import Key
 from seaopt.logs.quality.spectra import Spectra
 from seaopt.records import record
+from seaopt.signals import VectorN
 
 RANGE_DB = 40.0  # below the strongest band; what is weaker is not excited
 DIP_BANDS = 3  # of a third of an octave, between usable ones: the coherence may be low in them
 REACHED = 0.1  # of the largest power in a band; what is weaker is the window's
 PEAK = 1.2  # times the response in the lowest usable band, from which a largest one is a peak
+BESIDE = 1.6  # times and divided by the middle of the band of the largest response: where its peak is looked for
+SMOOTHING = np.array([0.25, 0.75, 1.0, 0.75, 0.25]) / 3.0  # of the lines of a whole log
+MOST_ROWS = 1 << 21  # of which a peak is looked for
 LEAST_COHERENCE = 0.5  # of an output with the input, power-weighted; below it most of the output is something else
 
 
@@ -49,12 +54,16 @@ class ThirdOctave:
 class InputExcitation:
     """The bands of one input; `output` is the one whose gains they have, "" where there is none."""
 
-    json_keys = (Key(field="usable_hz", name="told_hz"), "sentence", "bands", "channel", "nyquist_hz", "output")
+    json_keys = (
+        *(Key(field="usable_hz", name="told_hz"), "sentence", "bands", "channel", "nyquist_hz", "output"),
+        Key(field="top_hz", name="top_hz", omit_none=True),
+    )
 
     channel: str
     bands: tuple[ThirdOctave, ...]
     nyquist_hz: float
     output: str = ""
+    top_hz: float | None = None  # where the response is largest in and beside the band where it is, by lines of a log
 
     @property
     def usable_hz(self) -> tuple[float, float] | None:
@@ -90,7 +99,7 @@ class InputExcitation:
         if places is None:
             return None
         top, lowest = places[0], next(band for band in self.bands if band.usable)
-        return top.middle_hz if (top.gain or 0.0) > PEAK * (lowest.gain or 0.0) else None
+        return (self.top_hz or top.middle_hz) if (top.gain or 0.0) > PEAK * (lowest.gain or 0.0) else None
 
     def _find_roll_off(self) -> tuple[ThirdOctave, ThirdOctave] | None:
         """Return the band of the largest response and the first above it of half as much; None where none is."""
@@ -172,3 +181,34 @@ def assess_excitation(spectra: Spectra, channel: str, outputs: Sequence[str]) ->
             )
         )
     return InputExcitation(channel=channel, bands=tuple(bands), nyquist_hz=float(f[-1]), output=loudest or "")
+
+
+def find_top(excitation: InputExcitation, u: VectorN, y: VectorN, period: float) -> float | None:
+    """Return where the response of y to u is largest, near the peak of bands; None where no line there is usable.
+
+    Of lines of the whole log, smoothed: a chirp passes a resonance within one window or two, which see a part of its
+    ringing, and windows of a sixteenth of a log and thirds of an octave are wider than a light damping's peak.
+    """
+    near = excitation.peak_hz
+    if near is None:
+        return None
+    u, y = (_fill(values[:MOST_ROWS]) for values in (u, y))
+    f = np.fft.rfftfreq(u.size, period)
+    inside = np.flatnonzero((f > near / BESIDE) & (f < near * BESIDE))
+    if inside.size < SMOOTHING.size:
+        return None
+    first, second = np.fft.rfft(u - np.mean(u))[inside], np.fft.rfft(y - np.mean(y))[inside]
+    cross = np.convolve(np.conj(first) * second, SMOOTHING, "same")
+    power, other = (np.convolve(welch.square(lines), SMOOTHING, "same") for lines in (first, second))
+    coherence = welch.coherence(cross, power, other)
+    good = (coherence >= LEAST_COHERENCE) & (power >= REACHED * np.max(power))
+    if not np.any(good):
+        return None
+    std = np.sqrt(np.maximum(1.0 - coherence[good], 0.0) / coherence[good])  # up to a factor
+    return welch.find_top(f[inside][good], np.abs(cross[good]) / power[good], std)[0]
+
+
+def _fill(values: VectorN) -> VectorN:
+    """Return samples with straight lines across those that are missing."""
+    rows, known = np.arange(values.size), np.flatnonzero(np.isfinite(values))
+    return np.interp(rows, known, values[known])

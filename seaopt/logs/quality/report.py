@@ -17,7 +17,7 @@ from seaopt.errors import LogError, suggestion
 from seaopt.formatting import format_count
 from seaopt.logs.quality.channel import ChannelQuality, assess_channel
 from seaopt.logs.quality.clock import ClockQuality, assess_clock, split_rows
-from seaopt.logs.quality.excitation import InputExcitation, assess_excitation
+from seaopt.logs.quality.excitation import InputExcitation, assess_excitation, find_top
 from seaopt.logs.quality.faults import RowRanges
 from seaopt.logs.quality.findings import (
     Finding,
@@ -38,6 +38,7 @@ QUALITY_SCHEMA = "seaopt/quality/1"
 FILE, INSPECT_AGAIN = "quality.json", "inspect the log again"
 CHANNELS, PAIRS = 0.6, 0.4  # of the time
 MOVING_STD = 0.05  # of its standard deviation over the log: what makes a channel move during a run of another
+MOST_FILLED = 1000  # samples of a gap: of a longer one the rows beside it are put together
 MOST_PAIRED = 100  # outputs; of more only `SAME_SIGN` are correlated with each other
 ENOUGH_SAMPLES = FEWEST_WINDOWS * SHORTEST_WINDOW  # for spectra, in one segment
 
@@ -190,7 +191,7 @@ def assess_quality(data: Recording, *, inputs: Sequence[str] | None = None, prog
         hums = {name: find_hum(spectra, name, inputs) for name in spectra.channels}
         channels = {name: replace(channel, hum=hums.get(name)) for name, channel in channels.items()}
     pairs = () if spectra is None else _correlate_pairs(spectra, inputs, channels)
-    excitation = {} if spectra is None else _assess_inputs(spectra, inputs)
+    excitation = {} if spectra is None else _assess_inputs(spectra, inputs, varying, clock)
     findings = [*find_clock_faults(clock, data.time, channels.values())]
     for channel in channels.values():
         may_drive = not inputs and channel.unit in ("", *INPUT_UNITS)
@@ -271,10 +272,25 @@ def _correlate_pairs(
     return tuple(pair for pair in pairs if pair is not None)
 
 
-def _assess_inputs(spectra: Spectra, inputs: Sequence[str]) -> dict[str, InputExcitation]:
+def _assess_inputs(
+    spectra: Spectra, inputs: Sequence[str], values: Mapping[str, VectorN], clock: ClockQuality
+) -> dict[str, InputExcitation]:
     outputs = [name for name in spectra.channels if name not in inputs]
     bands = {name: assess_excitation(spectra, name, outputs) for name in inputs if name in spectra.channels}
-    return {name: excitation for name, excitation in bands.items() if excitation is not None}
+    return {
+        name: each if each.peak_hz is None else replace(each, top_hz=_find_top(each, values, clock))
+        for name, each in bands.items()
+        if each is not None
+    }
+
+
+def _find_top(excitation: InputExcitation, values: Mapping[str, VectorN], clock: ClockQuality) -> float | None:
+    """Return where the response is largest, by the lines of the whole log with its short gaps filled."""
+    lost = np.where(clock.lost <= MOST_FILLED, clock.lost, 0)
+    u, y = (
+        np.insert(values[name], np.repeat(clock.gaps, lost), np.nan) for name in (excitation.channel, excitation.output)
+    )
+    return find_top(excitation, u, y, clock.period)
 
 
 def _list_unjudged(
