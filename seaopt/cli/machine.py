@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any, Literal
 from seaopt.cli.export import list_broken_requirements, parse_tare
 from seaopt.cli.inspect import parse_pairs
 from seaopt.cli.progress import show_progress
-from seaopt.cli.provenance import FILES
+from seaopt.cli.provenance import FILES, digest_sources
 from seaopt.cli.session import SCHEMAS, Session
 from seaopt.cli.show import show_sections, show_verdicts
 from seaopt.cli.terminal import Amount, Terminal, spell_call
@@ -28,11 +28,11 @@ from seaopt.files import read_json, to_json, write_json, write_text
 from seaopt.logs import Quality, write_log
 from seaopt.logs.quality.report import QUALITY_SCHEMA
 from seaopt.machine import Acceptance, BringUp, Stage, accept, bring_up
-from seaopt.machine.acceptance import ACCEPT_AGAIN, ACCEPTANCE_SCHEMA, hash_source, take_ranges
+from seaopt.machine.acceptance import ACCEPTANCE_SCHEMA, FULL, hash_source, read_origin, take_ranges
 from seaopt.machine.bringup.files import write_stage
 from seaopt.machine.bringup.page import write_bring_up_page
-from seaopt.machine.bringup.plan import BRINGUP_SCHEMA, PLAN_AGAIN
-from seaopt.machine.bringup.stages import FULL, OF_A_STAGE, slow_down
+from seaopt.machine.bringup.plan import BRINGUP_SCHEMA, StoredReference, StoredStage, list_stages
+from seaopt.machine.bringup.stages import OF_A_STAGE, slow_down
 from seaopt.machine.page.page import write_acceptance_page
 from seaopt.machine.response.periods import Played
 from seaopt.machine.stepped import Source, stand
@@ -44,11 +44,10 @@ from seaopt.problem.stages import design_mpc, read_law, read_sweep
 from seaopt.reporting.responses import Responses
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
-from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.robustness import Certificate, JointTuning, linear_controller
 from seaopt.signals import REFERENCE, STATUS
 
-FILE, PAGE, QUALITY = "acceptance.json", "acceptance.html", "quality.json"
+FILE, PAGE, QUALITY = FILES["accept"], "acceptance.html", "quality.json"
 BRING_UP, PLAN = "bringup", "bringup.json"  # the folder of the stages, and what they are
 LATER = 5e-3  # s, by which a drive may be later than twice what it was
 AGAIN = "again"  # the folder of accepted logs, for a fit
@@ -86,7 +85,7 @@ def accept_logs(
     law, errors = session.law(), Terminal(stderr=True)
     session.warn_of_design(session.problem.certified_plants().values())
     source = _find_law(session, stage)
-    path = folder / FILES["tune"] if stage is None else folder / BRING_UP / stage / FILES["tune"]
+    path = _find_file(folder, stage)
     controller = law.controllers[0] if isinstance(law, ScheduledController) else law
     units = _list_units(controller)
     if isinstance(source, ScheduledController):
@@ -113,25 +112,18 @@ def accept_logs(
             link=link,
         )
     certificate, broken = _find_certificate(folder, stage, path)
-    result = replace(result, certificate=certificate, broken=broken)
-    content = write(result, session, logs, stage)
+    result = replace(result, certificate=certificate, broken=broken, stage=stage, fit_met=session.fit_met())
+    content = write(result, session, logs)
     again = write_again(result, session)
     if again:
         errors.wrap(f"note: to fit these logs too, put the tables of {again[-1]} into the problem file")
     files = [folder / FILE, folder / PAGE, *again]
     certify = session.spell("certify" if stage is None else "bringup")
-    return _show(result, session, content, files, json=json, amount=amount, again=certify)
-
-
-def _describe(result: Acceptance | BringUp, session: Session) -> dict[str, Any]:
-    """Return the content of a result's file; on a fit that is not met it is not met either."""
-    fit_met = session.fit_met()
-    return result.to_dict() | {"met": result.met and fit_met, "fit_met": fit_met}
+    return _show(result, content, files, json=json, amount=amount, again=certify)
 
 
 def _show(
     result: Acceptance | BringUp,
-    session: Session,
     content: dict[str, Any],
     files: Sequence[Path],
     *,
@@ -142,39 +134,37 @@ def _show(
     """Print a result; return whether it is met. `files`: that were written of it; `again`: what certifies its law."""
     if json:
         sys.stdout.write(to_json(content))
-        return content["met"]
+        return result.met
     console = Terminal()
     verdict = judge(result, Commands(certify=again))
-    if verdict is not None and not session.fit_met():
-        verdict = doubt_design(verdict)
     show_verdicts(console, [] if verdict is None else [verdict], verbose=amount == "verbose")
     if amount != "quiet":
         show_sections(console, result, verbose=amount == "verbose")
         console.list_files(files)
-    return content["met"]
+    return result.met
 
 
 def _find_played(folder: Path, stage: str | None, path: Path) -> Played | None:
     """Return how long the reference of a stage is, by the bring-up of a folder; None where it has no such stage."""
-    planned = (each for each in _list_planned(folder, path) if each["name"] == (stage or FULL))
+    planned = (each for each in _list_planned(folder, path) if each.name == (stage or FULL))
     plan = next(planned, None)
     if plan is None:
         return None
-    outer = plan.get("outer")  # of the outer loop, where that has a reference
-    return _count_seconds(plan["reference"], outer=None if outer is None else _count_seconds(outer["reference"]))
+    outer = plan.outer  # of the outer loop, where that has a reference
+    return _count_seconds(plan.reference, outer=None if outer is None else _count_seconds(outer.reference))
 
 
-def _count_seconds(reference: Mapping[str, Any], outer: Played | None = None) -> Played:
+def _count_seconds(reference: StoredReference, outer: Played | None = None) -> Played:
     """Return how long a planned reference is."""
-    periods = reference["periods"] * reference["phases"] + 2  # one that fades in, and one that fades out
-    return Played(period_s=reference["period_s"], lasts_s=periods * reference["period_s"], outer=outer)
+    periods = reference.periods * reference.phases + 2  # one that fades in, and one that fades out
+    return Played(period_s=reference.period_s, lasts_s=periods * reference.period_s, outer=outer)
 
 
-def _list_planned(folder: Path, path: Path) -> list[dict[str, Any]]:
+def _list_planned(folder: Path, path: Path) -> tuple[StoredStage, ...] | list[StoredStage]:
     """Return the stages of a folder's bring-up that are of the law of `path`, which may have been tuned again since."""
     try:
-        stages = read_json(folder / BRING_UP / PLAN, BRINGUP_SCHEMA)["stages"]
-        laws = [read_json(folder / BRING_UP / each["name"] / path.name, SCHEMAS["tune"]) for each in stages]
+        stages = list_stages(read_json(folder / FILES["bringup"], BRINGUP_SCHEMA))
+        laws = [read_json(folder / BRING_UP / each.name / path.name, SCHEMAS["tune"]) for each in stages]
         final = read_json(path, SCHEMAS["tune"])
     except SeaoptError:  # none was planned, or it was edited
         return []
@@ -197,55 +187,78 @@ def _find_certificate(
         if broken is not None:
             return "failed" if broken else "met", tuple(broken)
     planned = _list_planned(folder, path)
-    met = [
-        each["met"] for each in planned if each["name"] == stage or (stage is None and each["name"].startswith(FULL))
-    ]
+    met = [each.met for each in planned if each.name == stage or (stage is None and each.name.startswith(FULL))]
     return ("met" if all(met) else "failed") if met else "missing", ()
 
 
-def read_besides(session: Session) -> dict[str, Any]:
+def read_besides(session: Session, alone: bool) -> dict[str, Any]:
     """Return what lies in a session's folder besides fit, law and certificate, as it was written, by the commands that
-    made it; what is of another problem or law is left out with a remark. Raises FileError: a file is damaged.
+    made it; what is damaged, or of another problem, law or certificate, is left out with a remark. `alone`: also what
+    no stage of a whole run makes.
     """
     folder, problem = session.folder, session.problem
-    plan, kinds = folder / BRING_UP / PLAN, dict[str, Callable[[], Any]]()
-    kinds["sweep"] = lambda: session.read_besides("sweep", partial(read_sweep, problem, session.parameters()))
-    fit = session.read_besides("fit", Fit.from_dict)
-    kinds["frf"] = lambda: session.read_besides("frf", partial(Responses.from_dict, problem=problem, fit=fit))
-    if (folder / QUALITY).exists():
-        kinds["inspect"] = lambda: Quality.from_dict(read_json(folder / QUALITY, QUALITY_SCHEMA))
-    if (folder / FILE).exists():
-        kinds["accept"] = lambda: _read_acceptance(session)
-    if plan.exists():
-        kinds["bringup"] = lambda: _read_bring_up(session, plan)
+
+    def read_responses() -> Responses | None:
+        fit = session.read_besides("fit", Fit.from_dict)
+        return session.read_besides("frf", partial(Responses.from_dict, problem=problem, fit=fit))
+
+    kinds: dict[str, Callable[[], Any]] = {
+        "sweep": lambda: session.read_besides("sweep", partial(read_sweep, problem, session.parameters())),
+    }
+    further: dict[str, tuple[Path, Callable[[], Any]]] = {
+        "frf": (folder / FILES["frf"], read_responses),
+        "inspect": (
+            folder / QUALITY,
+            lambda: Quality.from_dict(read_json(folder / QUALITY, QUALITY_SCHEMA)),
+        ),
+        "accept": (
+            folder / FILES["accept"],
+            lambda: session.read_besides("accept", partial(_read_acceptance, session), ACCEPTANCE_SCHEMA),
+        ),
+        "bringup": (
+            folder / FILES["bringup"],
+            lambda: session.read_besides("bringup", partial(_read_bring_up, session), BRINGUP_SCHEMA),
+        ),
+    }
+    kinds |= {name: read for name, (path, read) in further.items() if alone and path.exists()}
     found = dict[str, Any]()
     for name, read in kinds.items():
         try:
             found[name] = read()
-        except ProblemError as error:
+        except SeaoptError as error:
             session.say(f"left out: {error}")
     return {name: result for name, result in found.items() if result is not None}
 
 
-def _read_acceptance(session: Session) -> Acceptance:
-    """Return the acceptance of a folder. Raises ProblemError: it is of a law that was tuned or planned again since."""
-    path = session.folder / FILE
-    content = read_json(path, ACCEPTANCE_SCHEMA, remedy=ACCEPT_AGAIN)
-    source = _find_law(session, content.get("stage"))
-    law = stand(source, (content.get("place") or {}).get("value"))
-    if not isinstance(source, ForceMPC) and content.get("law") != hash_source(law):
-        raise ProblemError(f"{path}: is of another law than is there now; {ACCEPT_AGAIN}")
-    return Acceptance.from_dict(content, source)
+def _read_acceptance(session: Session, content: dict[str, Any]) -> Acceptance:
+    """Return the acceptance of a folder. Raises ProblemError: its law was tuned, planned or certified again since."""
+    path, again, origin = session.folder / FILES["accept"], f"run {session.spell('accept')} again", read_origin(content)
+    source = _find_law(session, origin.stage)
+    law = stand(source, None if origin.place is None else origin.place.value)
+    if not isinstance(source, ForceMPC) and origin.law != hash_source(law):
+        raise ProblemError(f"{path}: is of another law than is there now; {again}")
+    result = Acceptance.from_dict(content, source)
+    certificate, broken = _find_certificate(session.folder, origin.stage, _find_file(session.folder, origin.stage))
+    if (result.certificate, result.broken) != (certificate, broken):
+        stated = result.certificate or "not known"
+        raise ProblemError(f"{path}: the certificate of its law was {stated}, and is {certificate} now; {again}")
+    return result
 
 
-def _read_bring_up(session: Session, path: Path) -> BringUp:
+def _read_bring_up(session: Session, content: dict[str, Any]) -> BringUp:
     """Return the bring-up of a folder. Raises ProblemError: a stage has another law than it had."""
-    content, link = read_json(path, BRINGUP_SCHEMA, remedy=PLAN_AGAIN), _find_link(session, _find_law(session, None))
-    laws = {str(stage["name"]): _find_law(session, str(stage["name"])) for stage in content["stages"]}
-    final = [laws[stage["name"]] for stage in content["stages"]][-1]
+    link = _find_link(session, _find_law(session, None))
+    laws = {stage.name: _find_law(session, stage.name) for stage in list_stages(content)}
+    *_, final = laws.values()
     if hash_source(final) != hash_source(_find_law(session, None)):
-        raise ProblemError(f"{path}: is of another law than is there now; {PLAN_AGAIN}")
+        path, again = session.folder / FILES["bringup"], session.spell("bringup")
+        raise ProblemError(f"{path}: is of another law than is there now; run {again} again")
     return BringUp.from_dict(content, laws, link)
+
+
+def _find_file(folder: Path, stage: str | None) -> Path:
+    """Return the file of a folder's law, or of that of a stage of its bring-up."""
+    return folder / FILES["tune"] if stage is None else folder / BRING_UP / stage / FILES["tune"]
 
 
 def _find_law(session: Session, stage: str | None) -> Source:
@@ -253,7 +266,7 @@ def _find_law(session: Session, stage: str | None) -> Source:
     if stage is None:
         law = session.law()
         return law if session.problem.mpc is None else session.plan()
-    path = session.folder / BRING_UP / stage / FILES["tune"]
+    path = _find_file(session.folder, stage)
     if not path.is_file():
         raise ProblemError(f"stage {stage}: {path} is not there; make it: {session.spell('bringup')}")
     return _read_stage(session, path)
@@ -319,11 +332,12 @@ def _find_others(session: Session, folder: Path, excluded: Path) -> dict[str, So
     return controllers
 
 
-def write(result: Acceptance, session: Session, logs: Sequence[Path], stage: str | None = None) -> dict[str, Any]:
-    """Write acceptance.json and its page; return the content of the first. `stage`: of whose law the logs are."""
+def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[str, Any]:
+    """Write acceptance.json and its page; return the content of the first."""
     command = spell_call()
-    content = _describe(result, session) | {"problem": session.problem.source, "stage": stage}
-    write_json(session.folder / FILE, content)
+    content = result.to_dict() | {"problem": session.problem.source}
+    made_from = digest_sources(session.problem, "accept", session.folder)
+    write_json(session.folder / FILE, content | {"made_from": made_from})
     write_acceptance_page(
         result,
         session.folder / PAGE,
@@ -331,7 +345,6 @@ def write(result: Acceptance, session: Session, logs: Sequence[Path], stage: str
         files=[Path(session.problem.source)],
         logs=logs,
         command=command,
-        fit_met=session.fit_met(),
     )
     return content
 
@@ -414,18 +427,19 @@ def plan_bring_up(
             keep_stage=keep_stage,
             progress=tell,
         )
-    content = _describe(plan, session)
-    write_json(target / PLAN, content)
+    plan = replace(plan, fit_met=session.fit_met())
+    content = plan.to_dict()
+    made_from = digest_sources(session.problem, "bringup", folder)
+    write_json(target / PLAN, content | {"made_from": made_from})
     page = write_bring_up_page(
         plan,
         target / "bringup.html",
         title=f"Bring-up: {session.problem.title}",
         files=[Path(session.problem.source)],
         command=spell_call(),
-        fit_met=session.fit_met(),
     )
     files = [target / PLAN, page, *(target / stage.name for stage in plan.stages)]
-    return _show(plan, session, content, files, json=json, amount=amount)
+    return _show(plan, content, files, json=json, amount=amount)
 
 
 def _slow_down(problem: Problem, fraction: float) -> Problem:

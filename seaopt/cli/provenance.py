@@ -23,6 +23,8 @@ FILES = {
     "tune": "controller.json",
     "sweep": "frontier.json",
     "certify": "robustness.json",
+    "accept": "acceptance.json",
+    "bringup": "bringup/bringup.json",
 }
 ROBUSTNESS = "[robustness]"  # the digest of what a design took from there
 
@@ -132,4 +134,6 @@ _READ_BY_STAGE: dict[str, tuple[Callable[[Problem], dict[str, Any]], tuple[str, 
     "tune": (_read_by_design, ("fit",)),
     "sweep": (_read_by_design, ("fit",)),
     "certify": (_read_by_certify, ("fit", "tune")),
+    "accept": (_read_by_certify, ("fit",)),  # which state of what law they are
+    "bringup": (_read_by_certify, ("fit",)),
 }

@@ -290,14 +290,15 @@ class Session:
         path = write_json(self._path(stage), content | {"made_from": made_from})
         self.written = [*(each for each in self.written if each != path), path]
 
-    def _read(self, stage: str) -> dict[str, Any]:
+    def _read(self, stage: str, schema: str = "") -> dict[str, Any]:
         """Read an earlier stage's result; one that was edited, or made from something else than is there, is refused. A
-        controller made for another [robustness] is taken, as a certificate may ask about it.
+        controller made for another [robustness] is taken, as a certificate may ask about it. `schema`: of no stage of
+        `SCHEMAS`.
         """
         path, again = self._path(stage), f"run {self.spell(stage)}"
         if not path.exists():
             raise ProblemError(f"{path}: no such file; {again} first")
-        content = read_json(path, SCHEMAS[stage], remedy=f"{again} again{OWN_LAW if stage == 'tune' else ''}")
+        content = read_json(path, schema or SCHEMAS[stage], remedy=f"{again} again{OWN_LAW if stage == 'tune' else ''}")
         made_from, expected = content["made_from"], digest_sources(self.problem, stage, self.folder)
         changed = {name for name in {*expected, *made_from} - {CONTENT} if expected.get(name) != made_from.get(name)}
         if changed - {ROBUSTNESS}:
@@ -313,10 +314,10 @@ class Session:
             self._say_once("note", [note])
         return content
 
-    def read_besides(self, stage: str, make: Callable[[dict[str, Any]], T]) -> T | None:
+    def read_besides(self, stage: str, make: Callable[[dict[str, Any]], T], schema: str = "") -> T | None:
         """Return a result that another stage can do without; None where there is none of this problem."""
         try:
-            return make(self._read(stage)) if self._path(stage).exists() else None
+            return make(self._read(stage, schema)) if self._path(stage).exists() else None
         except ProblemError as error:
             self.say(f"left out: {error}")
             return None
@@ -457,6 +458,7 @@ class Session:
     def _report(self, tell: Progress) -> None:
         self.plan_stages()  # refuses a file that has nothing to report of
         results: list[Any] = []
+        alone = not self.results  # of a whole run it is a report of what that made
         if self.problem.table.experiment:
             fitted = self.parameters()
             if isinstance(fitted, Fit):  # a design on measured points needs none
@@ -465,7 +467,7 @@ class Session:
                 results.append(self.results["fit"])
         from seaopt.cli.machine import read_besides  # deferred: it reads with a session
 
-        besides = read_besides(self)
+        besides = read_besides(self, alone)
         self.results.update(besides)
         results += besides.values()
         tuned = "tune" in self.results or self._path("tune").exists()
@@ -554,7 +556,7 @@ class Session:
         verdict = judge(result, commands)
         assert verdict is not None
         verdicts.append(verdict)
-        if stage != "fit" and not self.fit_met():
+        if stage not in ("fit", "accept", "bringup") and not self.fit_met():
             return [doubt_design(verdict) for verdict in verdicts]
         if self.problem.refused:  # a warning that a long fit's progress has left behind
             wrong = f"{self.problem.refused}; a design refuses this"
@@ -564,7 +566,8 @@ class Session:
 
     def spell(self, command: str) -> str:
         """Return a command on this problem as it is typed."""
-        return f"seaopt {command} {shlex.quote(self.problem.source)} -o {shlex.quote(str(self.folder))}"
+        logs = " LOG..." if command == "accept" else ""
+        return f"seaopt {command} {shlex.quote(self.problem.source)}{logs} -o {shlex.quote(str(self.folder))}"
 
     def show(self, as_json: bool, stages: list[str], amount: Amount = "usual") -> None:
         """Print the results of the stages on stdout: verdicts first, then figures, as much as is asked for."""

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import field, fields, replace
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
-from seaopt.codec import Key, check_agrees, from_content, list_keys, read_fields, to_content
+from seaopt.codec import Constraints, Key, check_agrees, from_content, list_keys, read_fields, to_content
 from seaopt.control import Controller, ForceMPC, ScheduledController, draw, runnable
 from seaopt.control.deploy.target import hash_law
 from seaopt.control.laws.delay import find_drive
@@ -51,6 +51,8 @@ TRIPPED = "the gate tripped before the reference had repeated often enough; reco
 UNTOLD_LAW = "the logs do not tell whether they are of this law; record what would tell, as is said of each"
 ACCEPTANCE_SCHEMA = "seaopt/acceptance/1"
 FILE, ACCEPT_AGAIN = "acceptance.json", "judge its logs again"
+FULL = "full"  # how the stages of a bring-up are named that are of the full law
+StageName = Annotated[str, Constraints(pattern=r"^\w+$")]  # that of its folder
 T = TypeVar("T")
 
 
@@ -78,6 +80,15 @@ class Place:
     over: str
     value: float
     unit: str
+
+
+@record
+class Origin:
+    """Whose logs an acceptance.json is of."""
+
+    law: str
+    stage: StageName | None
+    place: Place | None
 
 
 @record(eq=False, repr=False)
@@ -117,6 +128,12 @@ class Acceptance(Result, Worded):
         Of the law; None where nothing is known of one, as in `accept`. Without one that is met the law is not accepted.
     broken : tuple of str
         The requirements that a certificate says are not met.
+    stage : str or None
+        Of a bring-up, whose law this is; None of the full law. The law of a stage before the last is another one:
+        accepting its logs says nothing of the full law.
+    fit_met : bool or None
+        Whether the fit that the law was tuned with is met; None where nothing is known of one. Without one that is met
+        the law is not accepted.
     """
 
     json_keys = (
@@ -124,7 +141,8 @@ class Acceptance(Result, Worded):
         Key(field="broken", name="certificate_failed"),
         Key(field="logs", name="replay"),
         *("response", "enclosed", "differences", "left_out", "stepped"),
-        *(Key(field="stood", name="place"), "law"),
+        *(Key(field="stood", name="place"), "law", "stage"),
+        Key(field="fit_met", name="fit_met", omit_none=True),
     )
 
     controller: Controller
@@ -141,6 +159,13 @@ class Acceptance(Result, Worded):
     enclosed: bool = False
     certificate: Literal["met", "failed", "missing"] | None = None
     broken: tuple[str, ...] = ()
+    stage: StageName | None = None
+    fit_met: bool | None = None
+
+    @property
+    def of_full(self) -> bool:
+        """Whether it is of the full law."""
+        return self.stage is None or self.stage.startswith(FULL)
 
     @property
     def replayed(self) -> bool:
@@ -151,12 +176,12 @@ class Acceptance(Result, Worded):
     def met(self) -> bool:
         """Whether every log was made by this law, each limit of the loop is confirmed, and the machine is one of those
         that were certified, or, where nothing is known of a certificate, within the uncertainty that was given; no
-        link's position may have stayed under a closed outer loop.
+        link's position may have stayed under a closed outer loop, and the fit is met.
         """
         judged = self.response is not None and self.response.met
         certified = self.certificate in ("met", None) and (self.differences is None or self.differences.inside)
         followed = all(row.position_stays is None for row in self.replays)
-        return self.replayed and judged and certified and followed
+        return self.replayed and judged and certified and followed and self.fit_met is not False
 
     @property
     def logs(self) -> Replays:
@@ -188,7 +213,7 @@ class Acceptance(Result, Worded):
         """Return the acceptance of an acceptance.json, without logs and measured responses; nothing is replayed.
         `controller`: as of `accept`. Raises FileError: a field is missing or malformed, or contradicts another.
         """
-        missing = [key.name for key in list_keys(cls) if key.name not in content]
+        missing = [key.name for key in list_keys(cls) if key.name not in content and not key.omit_none]
         if missing:
             raise FileError(f"{FILE}: key {missing[0]} is missing; {ACCEPT_AGAIN}")
         read = read_fields(cls, content, FILE, remedy=ACCEPT_AGAIN)
@@ -207,12 +232,15 @@ class Acceptance(Result, Worded):
         )
         made = to_content(result)
         (made["response"] or {}).pop("measured", None)
-        if content.get("fit_met") is False:  # then it is not met either
-            made["met"] = False
         if isinstance(controller, ForceMPC):  # that is designed again, to what figures are known to on another machine
             del made["law"]
         check_agrees(content, made, FILE, remedy=ACCEPT_AGAIN)
         return result
+
+
+def read_origin(content: Mapping[str, Any]) -> Origin:
+    """Return whose logs an acceptance.json is of. Raises FileError: that is missing or malformed."""
+    return from_content(Origin, content, FILE, remedy=ACCEPT_AGAIN)
 
 
 def _read_part(content: Mapping[str, Any], key: str, cls: type[T]) -> tuple[T, ...]:

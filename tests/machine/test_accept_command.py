@@ -11,7 +11,8 @@ import pytest
 
 import seaopt as so
 from seaopt.cli.main import app
-from seaopt.files import write_json
+from seaopt.cli.session import Session
+from seaopt.files import to_json, write_json
 from seaopt.machine import bring_up
 from seaopt.problem.loop_logs import read_loop_log
 from seaopt.robustness.certificate.simulated import SIMULATIONS
@@ -213,7 +214,8 @@ def test_a_report_shows_what_lies_in_the_folder_as_its_commands_printed_it(folde
     content = path.read_text()
     path.write_text(content.replace('"met": true', '"met": false', 1))
     edited = run("report", problem, "-o", here / "out")
-    assert edited.exit_code != 0 and "bringup.json: was edited" in str(edited.exception)
+    assert edited.exit_code == 0 and "bringup.json: was edited" in " ".join(edited.output.split())
+    assert "Stage full" not in (here / "out" / "report.html").read_text()
     path.write_text(content)
     law = here / "out" / "bringup" / "full" / "controller.json"
     law.unlink()
@@ -221,15 +223,104 @@ def test_a_report_shows_what_lies_in_the_folder_as_its_commands_printed_it(folde
     assert lost.exit_code == 0 and "left out: stage full" in " ".join(lost.output.split())
 
 
+@pytest.fixture
+def planned(folder, accept, tmp_path, monkeypatch):
+    """Return a folder with a bring-up of a stage before the full law (the same law), and what reports of it."""
+    from typer.testing import CliRunner
+
+    def run(command, *arguments):
+        done = CliRunner().invoke(app, [command, str(here / "stand.toml"), *map(str, arguments), "-o", str(out)])
+        assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+        return done.exit_code, " ".join(done.output.split())
+
+    here = shutil.copytree(folder, tmp_path / "copy")
+    out = here / "out"
+    shutil.rmtree(out / "bringup", ignore_errors=True)
+    monkeypatch.setattr("seaopt.cli.machine.bring_up", partial(bring_up, fractions=()))
+    monkeypatch.setattr("seaopt.cli.session.write_report", lambda results, path, **_: path)
+    assert run("bringup", "--limit", "F1=900")[0] == 0
+    content = json.loads((out / "bringup" / "bringup.json").read_text())
+    content["stages"] = [content["stages"][0] | {"name": "stage_1"}, *content["stages"]]
+    write_json(out / "bringup" / "bringup.json", content)
+    shutil.copytree(out / "bringup" / "full", out / "bringup" / "stage_1")
+    return here, run
+
+
+def test_a_report_calls_the_acceptance_of_a_stage_none_of_the_full_law(planned):
+    here, run = planned
+    code, text = run("accept", here / "good.csv", "--stage", "stage_1")
+    assert code == 0 and "Acceptance of stage_1, not of the full law" in text
+    assert "they say nothing of the full law" in (here / "out" / "acceptance.html").read_text()
+    code, text = run("report")
+    assert code == 0 and "Acceptance of stage_1, not of the full law" in text and "Acceptance:" not in text
+    assert "Bring-up: 2 of 2 stages" in text
+
+
+def test_a_report_leaves_out_what_is_of_another_problem_or_certificate(planned):
+    here, run = planned
+    problem, certificate = here / "stand.toml", here / "out" / "robustness.json"
+    assert run("accept", here / "good.csv")[0] == 0
+    text, kept = problem.read_text(), certificate.read_bytes()
+    certificate.unlink()
+    problem.write_text(text.replace("[0.2, 0.6]", "[0.01, 6.0]"))
+    _, told = run("report")
+    assert "Acceptance" not in told and "Bring-up" not in told
+    for name, again in (("acceptance.json", "accept"), ("bringup.json", "bringup")):
+        assert f"{name}: was made from another problem file" in told and f"run seaopt {again}" in told
+    problem.write_text(text)
+    shutil.rmtree(here / "out" / "bringup")
+    _, told = run("report")
+    assert "the certificate of its law was met, and is missing now; run seaopt accept" in told
+    certificate.write_bytes(kept)
+    assert "Acceptance: the law makes" in run("report")[1]
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("acceptance.json", {"stage": 5}),
+        ("acceptance.json", {"stage": "../bringup/stage_1"}),
+        ("acceptance.json", {"place": [1.0]}),
+        ("acceptance.json", {"response": []}),
+        ("bringup/bringup.json", {"stages": None}),
+        ("bringup/bringup.json", {"stages": []}),
+        ("bringup/bringup.json", {"stages": [{"met": True}]}),
+        ("bringup/bringup.json", {"schema": "seaopt/bringup/1"}),
+    ],
+)
+def test_a_report_leaves_out_a_file_that_is_malformed(folder, accept, planned, file, change):
+    here, run = planned
+    assert run("accept", here / "good.csv")[0] == 0
+    path = here / "out" / file
+    write_json(path, json.loads(path.read_text()) | change)
+    code, text = run("report")
+    assert code == 0 and f"{path.name}: " in text and "left out: " in text
+    assert run("accept", here / "good.csv")[0] == 0
+
+
+def test_a_whole_run_is_not_judged_by_what_an_earlier_acceptance_says(planned):
+    here, run = planned
+    assert run("accept", here / "half.csv")[0] == 1 and run("report")[0] == 1
+    session = Session(here / "stand.toml", here / "out")
+    session.law()  # as a whole run has, which makes it
+    session.run("report")
+    assert session.met(["tune", "certify", "report"]) and "accept" not in session.results
+
+
 @pytest.mark.parametrize("again", [False, True])
 def test_no_length_is_advised_from_a_bring_up_of_another_law(folder, accept, tmp_path, again):
     """The stage's folder has the law that was planned, and the problem's may have been tuned again since."""
     planned, law = folder / "out" / "bringup", json.loads((folder / "out" / "controller.json").read_text())
-    reference = {"period_s": 4.0, "periods": 10, "phases": 1}
+    read = so.read_problem(folder / "stand.toml")
+    controller = so.Controller.from_dict(law, read.design_plant, read.values(read.parameters))
+    plants, values = read.certified_plants(), read.values(read.parameters)
+    certificate = so.certify(controller, plants, values, samples=5, simulations=False)
+    plan = bring_up(controller, plants, values, fractions=(), limits={"F1": 900.0}, certificate=certificate)
+    content = json.loads(to_json(plan.to_dict()))
+    content["stages"][0]["reference"] |= {"period_s": 4.0, "periods": 10, "phases": 1}
     law["law"] |= {"D": [2.0 * value for value in np.ravel(law["law"]["D"]).tolist()]} if again else {}
     write_json(planned / "full" / "controller.json", law)
-    stages = [{"name": "full", "reference": reference}]
-    write_json(planned / "bringup.json", {"schema": "seaopt/bringup/1", "stages": stages})
+    write_json(planned / "bringup.json", content)
     log = so.read_log(folder / "good.csv")
     so.write_log(log.between(0.0, 0.9), tmp_path / "short.csv")
     done = " ".join(accept(tmp_path / "short.csv").output.split())

@@ -99,7 +99,7 @@ def test_a_step_of_the_machine_lies_in_the_band(plan, compiler, tmp_path):
 
 def test_the_files_are_there_and_the_c_of_the_reference_is_the_table(plan, compiler, tmp_path):
     files = write_bring_up(plan, tmp_path)
-    assert json.loads((tmp_path / "bringup.json").read_text())["schema"] == "seaopt/bringup/1"
+    assert json.loads((tmp_path / "bringup.json").read_text())["schema"] == "seaopt/bringup/2"
     folder = tmp_path / "stage_1"
     assert {"force_law.c", "reference.csv", "reference.c", "expected_step.csv"} <= {path.name for path in files}
     (folder / "main.c").write_text(MAIN)

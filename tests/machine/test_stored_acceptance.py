@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -10,7 +11,7 @@ import seaopt as so
 from seaopt.errors import FileError
 from seaopt.files import read_json, seal, to_json, write_json
 from seaopt.machine import Acceptance
-from seaopt.machine.acceptance import ACCEPTANCE_SCHEMA
+from seaopt.machine.acceptance import ACCEPTANCE_SCHEMA, read_origin
 from tests.damage import damage
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
@@ -84,6 +85,40 @@ def test_an_acceptance_without_a_key_is_refused(content, controller, key):
     kept = {name: value for name, value in content.items() if name not in (key, "made_from")}
     with pytest.raises(FileError, match=f"key {key} is missing; judge its logs again"):
         Acceptance.from_dict(kept, controller)
+
+
+def test_what_was_judged_on_a_fit_that_is_not_met_is_not_met_when_it_is_read_back(content, controller):
+    made = {name: value for name, value in content.items() if name != "made_from"} | {"met": False, "fit_met": False}
+    again = Acceptance.from_dict(made, controller)
+    assert again.fit_met is False and not again.met
+    assert "on a fit that is not met" in repr(again)
+    with pytest.raises(FileError, match="met is True"):
+        Acceptance.from_dict(made | {"met": True}, controller)
+
+
+def test_the_acceptance_of_a_stage_is_none_of_the_full_law(results, controller):
+    whole = results["good"]
+    assert whole.stage is None and whole.of_full and repr(whole).startswith("met      Acceptance: ")
+    for stage, of_full in (("stage_1", False), ("full", True), ("full_2", True)):
+        content = json.loads(to_json(replace(whole, stage=stage).to_dict()))
+        again = Acceptance.from_dict(content, controller)
+        assert again.met and again.stage == stage and again.of_full is of_full
+        text = " ".join(repr(again).split())
+        assert f"Acceptance of {stage}" in text and ("not of the full law" in text) is not of_full
+        assert ("they say nothing of the full law" in text) is not of_full
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("stage", value) for value in (5, ["stage_1"], "../bringup/stage_1", "a\\b", "..", "", "stage_1\n")),
+        *(("place", value) for value in ([1.0], {"over": "q", "value": "x", "unit": "m"}, "q")),
+        *(("law", value) for value in (None, 7)),
+    ],
+)
+def test_whose_logs_they_are_is_told_by_a_malformed_file_in_one_line(content, key, value):
+    with pytest.raises(FileError, match=rf"acceptance\.json.*{key}.*judge its logs again"):
+        read_origin({name: each for name, each in content.items() if name != "made_from"} | {key: value})
 
 
 def test_another_version_is_refused(content, tmp_path):

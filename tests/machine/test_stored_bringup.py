@@ -10,7 +10,7 @@ import seaopt as so
 from seaopt.errors import FileError, SeaoptError
 from seaopt.files import read_json, seal, to_json, write_json
 from seaopt.machine import BringUp, write_bring_up
-from seaopt.machine.bringup.plan import BRINGUP_SCHEMA
+from seaopt.machine.bringup.plan import BRINGUP_SCHEMA, list_stages
 from tests.damage import damage
 
 
@@ -62,6 +62,7 @@ def test_a_bring_up_of_other_laws_is_refused(laws, content):
         ((), "stages", [], "stages"),
         (("stages", 0), "met", False, r"stages\.1\.met is False"),
         (("stages", 0), "name", 3, r"stages\.1\.name"),
+        (("stages", 0), "name", "../bringup/stage_1", r"stages\.1\.name"),
         (("stages", 0), "bandwidth_hz", 16.0, r"stages\.1\.bandwidth_hz is 16"),
         (("stages", 0), "channels", ["F1"], r"stages\.1\.channels"),
         (("stages", 0), "rate_hz", 500.0, r"stages\.1\.rate_hz"),
@@ -90,3 +91,40 @@ def test_a_bring_up_without_a_key_is_refused(content, laws, key):
     kept = {name: value for name, value in content.items() if name != "made_from"} | {"stages": stages}
     with pytest.raises(FileError, match=f"{key}.*plan the stages again"):
         BringUp.from_dict(kept, laws)
+
+
+def test_a_bring_up_on_a_fit_that_is_not_met_is_not_met_when_it_is_read_back(content, laws):
+    made = {name: value for name, value in content.items() if name != "made_from"} | {"met": False, "fit_met": False}
+    again = BringUp.from_dict(made, laws)
+    assert again.fit_met is False and not again.met and all(stage.met for stage in again.stages)
+    assert "on a fit that is not met" in repr(again)
+
+
+@pytest.mark.parametrize("stages", [None, [], ["full"], "full", [{}], [{"name": "full"}], {}])
+def test_a_bring_up_without_its_stages_is_refused_in_one_line(content, stages):
+    kept = {name: value for name, value in content.items() if name not in ("made_from", "stages")}
+    for damaged in (kept, kept | {"stages": stages}):
+        with pytest.raises(FileError, match=r"bringup\.json.*stages.*plan the stages again") as caught:
+            list_stages(damaged)
+        assert "\n" not in str(caught.value)
+
+
+def test_an_older_bring_up_without_laws_is_of_another_version(content, tmp_path):
+    path = write_json(tmp_path / "bringup.json", content | {"schema": "seaopt/bringup/1"})
+    with pytest.raises(FileError, match="seaopt/bringup/1"):
+        read_json(path, BRINGUP_SCHEMA)
+
+
+def test_a_stage_is_handed_on_again_once_it_says_that_the_next_is_left_out(controller):
+    def refuse(fraction):
+        raise SeaoptError("none")
+
+    plants, thor, kept = {"stand": so.plants.high_impedance()}, so.plants.thor(), []
+    certificate = so.certify(controller, plants, thor, samples=5, simulations=False)
+    plan = so.bring_up(
+        controller, plants, thor, samples=5, fractions=(0.25, 0.26), limits={"F1": 900.0}, certificate=certificate,
+        tune_stage=lambda fraction: controller, certify_stage=lambda law: certificate, keep_stage=kept.append,
+    )  # fmt: skip
+    assert "stage_2 would be the same experiment" in plan.stages[0].note
+    last = {stage.name: stage for stage in kept}
+    assert [last[stage.name].note for stage in plan.stages] == [stage.note for stage in plan.stages]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -81,8 +82,8 @@ def write_bring_up(
         The folder cannot be written.
     """
     target = Path(folder)
-    doubt = {} if fit_met is None else {"met": plan.met and fit_met, "fit_met": fit_met}
-    files = [write_json(target / "bringup.json", plan.to_dict() | doubt)]
+    plan = plan if fit_met is None else replace(plan, fit_met=fit_met)
+    files = [write_json(target / "bringup.json", plan.to_dict())]
     for stage in plan.stages:
         files += write_stage(stage, target / stage.name, tare=tare, fit_met=fit_met)
     return tuple(files)

@@ -21,6 +21,7 @@ from seaopt.reporting.page.render import write_result_page
 from seaopt.reporting.sections.data import Commands, KeyFigure, Reason, Section, Step, Table, Verdict, mark_met
 from seaopt.reporting.sections.kinds.certificate import find_remedy, state_failure
 from seaopt.reporting.sections.kinds.controller import explain_sliding, say_bandwidths, show_stuck_bandwidth
+from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.robustness.certificate.requirement import group_failures
 from seaopt.units import mechanics_of, unit_after
 
@@ -80,7 +81,8 @@ def judge(result: BringUp, commands: Commands) -> Verdict | None:
     )
     remedies = dict.fromkeys(filter(None, (find_remedy(failure.worst) for _, failure in failures)))
     text = f"Bring-up: {len(good)} of {format_count(len(result.stages), 'stage')} with a certified law"
-    return Verdict(met=result.met, text=text, reasons=reasons, next=tuple(Step(text=each) for each in remedies))
+    verdict = Verdict(met=result.met, text=text, reasons=reasons, next=tuple(Step(text=each) for each in remedies))
+    return doubt_design(verdict) if result.fit_met is False else verdict
 
 
 OUTER = (
@@ -345,7 +347,6 @@ def write_bring_up_page(
     title: str = "Bring-up",
     files: Sequence[Path | str] = (),
     command: str = "",
-    fit_met: bool = True,
 ) -> Path:
     """Write an HTML page of a bring-up, to be printed; it needs no network and no other file.
 
@@ -361,8 +362,6 @@ def write_bring_up_page(
         What it was made of: the problem file.
     command : str
         What was typed to make it, to be stated.
-    fit_met : bool
-        Whether the fit that the law was tuned with is met; the verdict states one that is not.
 
     Raises
     ------
@@ -380,7 +379,6 @@ def write_bring_up_page(
         title=title,
         parts=PARTS,
         verdict=judge(result, Commands()),
-        fit_met=fit_met,
         glance=summarise(result),
         sections=[*describe(result), describe_provenance((), files, command)],
         plates={"stages": plates},

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from seaopt.codec import Constraints, OrInfinite, check_agrees, from_content, to_content
+from seaopt.codec import Constraints, Key, OrInfinite, check_agrees, from_content, to_content
 from seaopt.control import ForceMPC
 from seaopt.errors import FileError
-from seaopt.machine.acceptance import hash_source
+from seaopt.machine.acceptance import StageName, hash_source
 from seaopt.machine.bringup.excitation import Excitation
 from seaopt.machine.bringup.expected import Band, Expected, OuterExpected, enclose_link
 from seaopt.machine.response.judged import Prediction
@@ -22,7 +22,7 @@ from seaopt.records import Result, Worded, record
 from seaopt.robustness import Certificate, Requirement
 from seaopt.signals import REFERENCE
 
-BRINGUP_SCHEMA = "seaopt/bringup/1"
+BRINGUP_SCHEMA = "seaopt/bringup/2"
 FILE, PLAN_AGAIN = "bringup.json", "plan the stages again: seaopt bringup"
 
 
@@ -77,7 +77,7 @@ class Stage(Expected):
 
 
 @record
-class _Reference:
+class StoredReference:
     """A reference without its waves."""
 
     amplitude: float
@@ -116,7 +116,7 @@ class _Bands:
 class _Played:
     """What is played, and what it is to do."""
 
-    reference: _Reference
+    reference: StoredReference
     friction: Motion | None
     under_reference: _UnderReference | None
     peaks: Mapping[str, float]
@@ -127,7 +127,7 @@ class _Played:
 
 
 @record
-class _Stage(_Played):
+class StoredStage(_Played):
     """A stage, whose law is in its own controller.json."""
 
     json_keys = (
@@ -136,7 +136,7 @@ class _Stage(_Played):
         *("outer", "outer_unstable", "requirements"),
     )
 
-    name: str
+    name: StageName
     note: str
     met: bool
     law: str  # what tells it from any other
@@ -151,27 +151,39 @@ class _Stage(_Played):
 
 
 @record
-class _BringUp:
+class StoredPlan:
     """What bringup.json has."""
 
+    json_keys = ("met", Key(field="fit_met", name="fit_met", omit_none=True), "stages")
+
     met: bool
-    stages: Annotated[tuple[_Stage, ...], Constraints(min_length=1)]
+    fit_met: bool | None = None
+    stages: Annotated[tuple[StoredStage, ...], Constraints(min_length=1)]
 
 
 @record(eq=False, repr=False)
 class BringUp(Result, Worded):
-    """The stages of a bring-up, the full law last."""
+    """The stages of a bring-up, the full law last.
+
+    Parameters
+    ----------
+    stages : tuple of Stage
+        In the order in which they are played.
+    fit_met : bool or None
+        Whether the fit that the laws were tuned with is met; None where nothing is known of one.
+    """
 
     stages: tuple[Stage, ...]
+    fit_met: bool | None = None
 
     @property
     def met(self) -> bool:
-        """Whether the law of every stage is certified."""
-        return all(stage.met for stage in self.stages)
+        """Whether the law of every stage is certified, and the fit is met."""
+        return all(stage.met for stage in self.stages) and self.fit_met is not False
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of bringup.json (schema seaopt/bringup/1)."""
-        stored = _BringUp(met=self.met, stages=tuple(_describe(each) for each in self.stages))
+        """Return the content of bringup.json (schema seaopt/bringup/2)."""
+        stored = StoredPlan(met=self.met, fit_met=self.fit_met, stages=tuple(map(_describe, self.stages)))
         return {"schema": BRINGUP_SCHEMA} | to_content(stored)
 
     @classmethod
@@ -182,18 +194,21 @@ class BringUp(Result, Worded):
         or simulated. `laws`: that of each stage, by its name. `link`: as of `bring_up`. Raises FileError: a field is
         missing or malformed, contradicts another, or is of another law.
         """
-        stored = from_content(_BringUp, content, FILE, remedy=PLAN_AGAIN)
-        plan = cls(stages=tuple(_make_stage(each, laws, link) for each in stored.stages))
-        made = plan.to_dict()
-        if content.get("fit_met") is False:  # then it is not met either
-            made["met"] = False
-        check_agrees(content, made, FILE, remedy=PLAN_AGAIN)
+        stored = from_content(StoredPlan, content, FILE, remedy=PLAN_AGAIN)
+        stages = tuple(_make_stage(each, laws, link) for each in stored.stages)
+        plan = cls(stages=stages, fit_met=stored.fit_met)
+        check_agrees(content, plan.to_dict(), FILE, remedy=PLAN_AGAIN)
         return plan
 
 
-def _describe(stage: Stage) -> _Stage:
+def list_stages(content: Mapping[str, Any]) -> tuple[StoredStage, ...]:
+    """Return the stages of a bringup.json, without their laws. Raises FileError: a field is missing or malformed."""
+    return from_content(StoredPlan, content, FILE, remedy=PLAN_AGAIN).stages
+
+
+def _describe(stage: Stage) -> StoredStage:
     controller, around = stage.controller, stage.around
-    return _Stage(
+    return StoredStage(
         name=stage.name,
         note=stage.note,
         met=stage.met,
@@ -213,7 +228,7 @@ def _describe(stage: Stage) -> _Stage:
 def _describe_played(expected: Expected) -> dict[str, Any]:
     excitation, prediction = expected.excitation, expected.prediction
     return {
-        "reference": _Reference(
+        "reference": StoredReference(
             amplitude=excitation.amplitude,
             bias=excitation.bias,
             unit=expected.unit,
@@ -240,7 +255,7 @@ def _describe_played(expected: Expected) -> dict[str, Any]:
     }
 
 
-def _make_stage(stored: _Stage, laws: Mapping[str, Source], link: tuple[Plant, ParameterSet] | None) -> Stage:
+def _make_stage(stored: StoredStage, laws: Mapping[str, Source], link: tuple[Plant, ParameterSet] | None) -> Stage:
     """Return a stage with its law."""
     source = laws.get(stored.name)
     if source is None:

@@ -12,7 +12,7 @@ from seaopt.bench import Sensors
 from seaopt.control import Controller, ControllerSpec, ForceMPC, ScheduledController
 from seaopt.errors import ControlError, SeaoptError, require_number, require_type
 from seaopt.estimation import Fit
-from seaopt.machine.acceptance import hash_source, list_draws
+from seaopt.machine.acceptance import FULL, hash_source, list_draws
 from seaopt.machine.bringup.expected import (
     BARELY,
     MOVES,
@@ -31,7 +31,7 @@ from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
 from seaopt.robustness import Certificate, certify, linear_controller, tune_certified
 
-FRACTIONS, FULL = (0.25, 0.5), "full"  # what the stages before the last ask for, and the name of the last
+FRACTIONS = 0.25, 0.5  # what the stages before the last ask for
 UPWARDS = (1.0, 1.3, 1.7)  # times a stage's bandwidth: what is tried in turn
 NOISE_ROOM = 0.75  # of a stage's limit of its command, that noise alone may take
 DRAWS = 60
@@ -97,7 +97,8 @@ def bring_up(
         How the law at a fraction of the bandwidth is tuned, and how a stage's law is certified, where more than plants
         and ranges count.
     keep_stage : callable, optional
-        Called with each stage as soon as it is planned: the next may take minutes.
+        Called with each stage as soon as it is planned: the next may take minutes; and again with one whose note then
+        says that the next is left out.
     seed : int
         Of phases and draws.
     progress : callable, optional
@@ -164,8 +165,8 @@ def bring_up(
     draws = draw(stand(controller, None))
     stages, count = list[Stage](), len(fractions) + len(controller.points)
 
-    def keep(stage: Stage) -> None:
-        stages.append(stage)
+    def keep(stage: Stage, at: int | None = None) -> None:
+        stages[len(stages) if at is None else at :] = [stage]
         if keep_stage is not None:
             keep_stage(stage)
 
@@ -178,7 +179,7 @@ def bring_up(
         expected = _expect_stage(law, draws, part)
         if stages and is_same_experiment(stages[-1], expected):
             same = SAME.format(number, note or f"the law at {fraction:g} of the bandwidth")
-            stages[-1] = replace(stages[-1], note="; ".join(filter(None, (stages[-1].note, same))))
+            keep(replace(stages[-1], note="; ".join(filter(None, (stages[-1].note, same)))), at=-1)
             continue
         if judged is None:
             tell("certifying the law with less effort")

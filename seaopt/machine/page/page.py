@@ -132,6 +132,10 @@ HIDDEN = (
     "of the rounding of the whole log by {} std."
 )
 AND = "with the first one also: "
+OF_A_STAGE = (
+    "The logs are of {} of the bring-up, whose law is another one: they say nothing of the full law, which is accepted "
+    "by logs of its own."
+)
 
 
 def _say_stuck(row: Judged, controller: Controller) -> str:
@@ -174,10 +178,11 @@ def _say_no_margin(row: Judged, response: Response) -> str:
 def describe(result: Acceptance) -> list[Section]:
     """Return what was compared, what may be the cause where it differs, and what the response says."""
     sections = _describe_replay(result)
+    told = [] if result.of_full else [OF_A_STAGE.format(result.stage)]
     if result.place is not None:
         over, value, unit = result.place
-        told = f"The schedule is judged where {over} stood: {format_number(value)}{unit_after(unit)}."
-        sections[0] = replace(sections[0], sentences=(told,))
+        told.append(f"The schedule is judged where {over} stood: {format_number(value)}{unit_after(unit)}.")
+    sections[0] = replace(sections[0], sentences=tuple(told))
     if result.response is not None:
         sections.append(_describe_response(result, result.response))
     if result.differences is not None:
@@ -484,7 +489,6 @@ def write_acceptance_page(
     files: Sequence[Path | str] = (),
     logs: Sequence[Path | str] = (),
     command: str = "",
-    fit_met: bool = True,
 ) -> Path:
     """Write an HTML page of an acceptance; it needs no network and no other file.
 
@@ -502,8 +506,6 @@ def write_acceptance_page(
         The logs that were judged.
     command : str
         What was typed to make it, to be stated.
-    fit_met : bool
-        Whether the fit that the law was tuned with is met; the verdict states one that is not.
 
     Raises
     ------
@@ -515,7 +517,6 @@ def write_acceptance_page(
         title=title,
         parts=PARTS,
         verdict=judge(result, Commands()),
-        fit_met=fit_met,
         glance=summarise(result),
         sections=[*describe(result), *_tell_missing(result), describe_provenance((), files, command, logs)],
         plates={

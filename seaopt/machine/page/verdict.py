@@ -23,6 +23,7 @@ from seaopt.machine.wording import (
 )
 from seaopt.plants.friction import list_friction_parameters
 from seaopt.reporting.sections.data import Commands, Reason, Step, Style, Verdict
+from seaopt.reporting.sections.verdict import doubt_design
 from seaopt.units import unit_after
 
 OUTCOMES: dict[str, Style] = {"confirmed": "good", "refuted": "bad", "undecided": "warning"}
@@ -93,7 +94,16 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
         reasons += [Reason(what=f"no response: {text}") for text in list_left_out(result)]
     missing = result.certificate == "missing" and commands.certify
     steps = (Step(text="certify the law:", copied=(commands.certify,)),) if missing else ()
-    return Verdict(met=result.met, text=f"Acceptance: {'; '.join(parts)}", reasons=tuple(reasons), next=steps)
+    text = f"{name_acceptance(result)}: {'; '.join(parts)}"
+    verdict = Verdict(met=result.met, text=text, reasons=tuple(reasons), next=steps)
+    return doubt_design(verdict) if result.fit_met is False else verdict
+
+
+def name_acceptance(result: Acceptance) -> str:
+    """Return of which law the acceptance is."""
+    if result.stage is None:
+        return "Acceptance"
+    return f"Acceptance of {result.stage}" + ("" if result.of_full else ", not of the full law")
 
 
 def list_left_out(result: Acceptance) -> list[str]:

@@ -15,7 +15,6 @@ from seaopt.formatting import format_number, printable
 from seaopt.reporting.sections.data import KeyFigure, Section, Verdict
 from seaopt.reporting.sections.glossary import explain_terms
 from seaopt.reporting.sections.html import render_section
-from seaopt.reporting.sections.verdict import doubt_design
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -46,13 +45,8 @@ def write_result_page(
     glance: Sequence[KeyFigure],
     sections: Iterable[Section],
     plates: Mapping[str, Any],
-    fit_met: bool = True,
 ) -> Path:
-    """Write the page of a result that is no stage of a report; sections and plates stand in its `parts`. The verdict on
-    what was made with a fit that is not met says so.
-    """
-    if verdict is not None and not fit_met:
-        verdict = doubt_design(verdict)
+    """Write the page of a result that is no stage of a report; sections and plates stand in its `parts`."""
     html = render_template(
         "page.html.jinja",
         title=title,

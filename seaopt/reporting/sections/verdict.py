@@ -32,7 +32,7 @@ def judge_results(
     fit, controller, mpc, certificate, verification : optional
         Results, the later ones made with the earlier ones.
     besides : sequence
-        Others that were made with them.
+        Others, which say themselves what they rest on.
     expectations : sequence of (bool, str)
         Of a problem file: whether each is met, and what to say of it.
 
@@ -43,10 +43,14 @@ def judge_results(
     >>> [one.text for one in judge_results(controller=controller)]
     ['Controller: pid on F1, 30 Hz, every limit met']
     """
-    designs = (controller, mpc, certificate, verification, *besides)
-    judged = [verdict for design in designs if design is not None and (verdict := judge(design)) is not None]
+    designs, others = (
+        [verdict for result in results if result is not None and (verdict := judge(result)) is not None]
+        for results in ((controller, mpc, certificate, verification), besides)
+    )
+    if fit is not None and not fit.met:
+        designs = [doubt_design(verdict) for verdict in designs]
+    judged = [*designs, *others]
     if fit is not None:
-        judged = judged if fit.met else list(map(doubt_design, judged))
         judged = [name_guesses(verdict, fit.guesses) for verdict in (judge(fit), *judged) if verdict is not None]
     return [*judged, *judge_expectations(expectations)]
 
