@@ -27,7 +27,7 @@ FILE, PLAN_AGAIN = "bringup.json", "plan the stages again: seaopt bringup"
 
 
 @record(eq=False)
-class Stage(Expected):
+class Stage(Expected, Result):
     """One law on its way to the machine.
 
     Parameters
