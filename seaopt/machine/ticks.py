@@ -33,7 +33,7 @@ class Gaps:
     ticks: int  # that have no row, by its clock
     rows: int  # with a number missing
     count: int  # of places where either is
-    first_s: float  # from the log's start to the first
+    first_s: float  # from the log's start to the last row before the first
     longest: int  # rows of the longest stretch without
 
 
@@ -246,7 +246,7 @@ def _find_gaps(log: Log, has_all: Bool[np.ndarray, " n"], longest: slice) -> Gap
         ticks=int(np.sum(lost)),
         rows=int(np.sum(~has_all)),
         count=int(np.sum(starts)),
-        first_s=float(log.time[np.argmax(starts)] - log.time[0]),
+        first_s=float(log.time[max(int(np.argmax(starts)) - 1, 0)] - log.time[0]),
         longest=longest.stop - longest.start,
     )
 

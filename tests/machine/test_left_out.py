@@ -144,6 +144,9 @@ def test_periods_with_a_gap_are_counted_and_all_others_used(controller, bench, r
     gaps, says = record["replay"]["logs"][0]["gaps"], f"bench has no row of {len(rows)} tick"
     assert (gaps["ticks"], gaps["rows"]) == (len(rows), 0)
     assert says in terminal and says in page
+    assert gaps["first_s"] == pytest.approx((rows[0] - 1) * 1e-3, abs=1e-12)
+    says = f"the first after {(rows[0] - 1) * 1e-3:g} s"
+    assert says in terminal and says in page
 
 
 def test_periods_beside_gaps_say_what_they_say_without(controller, bench):

@@ -455,7 +455,7 @@ def _say_gaps(name: str, gaps: Gaps, row: Replay) -> str:
     """Return what a log lacks, and what to do about it."""
     lacks = [f"no row of {format_count(gaps.ticks, 'tick')}"] if gaps.ticks else []
     lacks += [f"{format_count(gaps.rows, 'row')} with a number missing"] if gaps.rows else []
-    places = f"in {format_count(gaps.count, 'place')}, the first after {format_number(gaps.first_s, 3)} s"
+    places = f"in {format_count(gaps.count, 'place')}, the first after {format_number(gaps.first_s, 6)} s"
     replayed = f"its longest stretch without, of {format_count(gaps.longest, 'tick')}"
     if row.stretches > 1:
         each = "each from a state that its own first rows tell"
