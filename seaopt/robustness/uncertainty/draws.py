@@ -209,11 +209,11 @@ def combine_uncertainty(
     Raises
     ------
     ControlError
-        The fit leaves a parameter undetermined, or a range is empty or names nothing.
+        The fit leaves a parameter of these plants undetermined, or a range is empty or names nothing.
     """
     from scipy.linalg import block_diag  # deferred: scipy is slow to load
 
-    plant_names = {name for plant in plants.values() for name in plant.parameters}
+    plant_names = {name for plant in plants.values() for name in plant.parameters} | {DRIVE_DELAY}
     check_ranges(ranges, plants)
     if isinstance(source, Fit):
         covariance = source.total_covariance if drive is None else drive.take_covariance(source)
@@ -221,7 +221,7 @@ def combine_uncertainty(
         if source.status not in ("converged", "not_identifiable"):
             raise ControlError(f"the fit has not converged ({source.message}); nothing can be certified from it")
         for name in names:
-            if not np.isfinite(covariance.std(name)) and name not in ranges:
+            if name in plant_names and name not in ranges and not np.isfinite(covariance.std(name)):
                 raise ControlError(
                     f"parameter {name} is not identifiable in the fit, so nothing can be certified; "
                     "fix it, give it a prior_std, or give its range"
@@ -238,7 +238,6 @@ def combine_uncertainty(
     stds = {name: p.prior_std for name, p in supplement.items() if p.prior_std is not None}
     whole = np.asarray(block_diag(matrix, np.diag(np.square(list(stds.values())))))
     uncertain = (*names, *stds)
-    plant_names.add(DRIVE_DELAY)
     used = [
         i for i, name in enumerate(uncertain) if name not in ranges and name in plant_names and np.isfinite(whole[i, i])
     ]

@@ -10,6 +10,8 @@ import pytest
 import seaopt as so
 from seaopt.control.laws.delay import Drive
 from seaopt.control.loops.sampled_plant import DRIVE_DELAY
+from seaopt.errors import ControlError
+from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.widening import widen
 from seaopt.robustness.uncertainty.draws import combine_uncertainty
 from seaopt.testing import virtual_experiment
@@ -54,3 +56,26 @@ def test_the_covariance_of_the_fit_stays_that_of_the_noise(fitted):
     assert wide.nuisance[experiment].fitted["delay_s"].model_std >= 1e-4
     r, m_k = wide.derived["r"], wide.derived["m_k"]
     assert r.model_std == 0.0 and m_k.model_std > 0.015 * m_k.value  # m_k grows with J
+
+
+def test_what_the_fit_leaves_open_of_no_certified_plant_does_not_stand_in_the_way(fitted):
+    """Of friction that differs by direction, which the plant of the experiments alone has."""
+    stand, fit, *_ = fitted
+    directed = so.plants.high_impedance(parts=("friction_direction",))
+    names, n = fit.covariance.names, len(fit.covariance.names)
+    matrix = np.full((n + 1, n + 1), np.inf)
+    matrix[:n, :n] = fit.covariance.matrix
+    vague = replace(
+        fit,
+        status="not_identifiable",
+        parameters=fit.parameters.with_parameters(replace(directed.defaults["f_a"], free=True, identified=False)),
+        covariance=Covariance(names=(*names, "f_a"), matrix=matrix),
+        delay_covariance=None,
+        model_covariance=None,
+    )
+    uncertain = combine_uncertainty(vague, so.ParameterSet(), {}, {"stand": stand})
+    assert uncertain.names == names and np.array_equal(uncertain.covariance, fit.covariance.matrix)
+    with pytest.raises(ControlError, match="f_a is not identifiable"):
+        combine_uncertainty(vague, so.ParameterSet(), {}, {"stand": stand, "directed": directed})
+    ranged = combine_uncertainty(vague, so.ParameterSet(), {"f_a": (0.0, 1.0)}, {"stand": stand, "directed": directed})
+    assert ranged.names == names and set(ranged.ranges) == {"f_a"}
