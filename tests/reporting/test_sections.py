@@ -17,7 +17,7 @@ from seaopt.reporting.sections.data import Item, Mark, Reason, Section, Step, Ta
 from seaopt.reporting.sections.glossary import GLOSSARY, explain_terms
 from seaopt.reporting.sections.html import render_section
 from seaopt.reporting.sections.html import render_verdict as render_html_verdict
-from seaopt.reporting.sections.kinds.fit import spell_cure
+from seaopt.reporting.sections.kinds.fit import describe, spell_cure
 from seaopt.reporting.sections.text import Most, join, render_sections, render_table, render_verdict
 
 WORDS = "a limit of the loop on the plant that swings is missed by some draws"
@@ -92,6 +92,21 @@ def test_a_new_row_of_a_result_appears_everywhere(fitted, tmp_path, capsys, with
         assert text.count("invented") == 1
         row = re.sub(r"<[^>]*>", " ", text.split("invented")[1].split("derived")[0])
         assert row.split()[:3] == ["12.25", "±", "0.5"] and "N s/m" in row
+
+
+@pytest.mark.parametrize(
+    ("message", "sentence"),
+    [
+        ("eta cannot be told", "eta cannot be told."),
+        ("b_r, eta and J enter only together", "b_r, eta and J enter only together."),
+        ("chirp.F1: off", "chirp.F1: off."),
+        ("stalled, as steps are", "Stalled, as steps are."),
+        ("re-weighted twice", "Re-weighted twice."),
+    ],
+)
+def test_a_name_at_the_start_of_a_sentence_stays_as_it_is_written(fitted, message, sentence):
+    (parameters, *_) = describe(replace(fitted, message=message))
+    assert parameters.sentences[0] == sentence
 
 
 def test_a_new_requirement_of_a_certificate_appears_everywhere(certificate, tmp_path, capsys, without_drawing):

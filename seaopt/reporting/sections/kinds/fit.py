@@ -80,12 +80,18 @@ def describe(fit: Fit) -> list[Section]:
 
 def _list_caveats(fit: Fit) -> Iterator[str]:
     if not _repeats(fit):
-        yield f"{fit.message[:1].upper()}{fit.message[1:]}."
+        yield f"{_begin_sentence(fit, fit.message)}."
     if fit.caveat:
-        yield f"{fit.caveat[:1].upper()}{fit.caveat[1:]}."
+        yield f"{_begin_sentence(fit, fit.caveat)}."
     for direction in fit.identifiability.unidentifiable:
         yield f"Not identifiable: {' + '.join(f'{weight:.2g} {name}' for name, weight in direction.items())}."
     yield from _say_silent(fit)
+
+
+def _begin_sentence(fit: Fit, text: str) -> str:
+    """Return a text with a capital, but where it begins with a name: of a parameter, or of an experiment's output."""
+    word = text.split(" ", 1)[0].rstrip(",;")
+    return text if word in fit.parameters or not word.replace("-", "").isalpha() else f"{text[:1].upper()}{text[1:]}"
 
 
 def _repeats(fit: Fit) -> bool:
