@@ -242,6 +242,7 @@ def test_json_lines_and_entries(tmp_path):
         ('{"time": 0, "time": 1, "F": 2}\n{"time": 1}\n', '2 keys of one entry are named "time"'),
         ('{"time": 0, "F": 1e999}\n{"time": 1, "F": 1}\n', "is not finite"),
         ('{"time": [1, 2], "F": [1]}', "differ in length"),
+        ('{"schema": "seaopt/fit/2", "notes": ["a"], "findings": []}', "is a result .*seaopt/fit/2.*, and no log"),
         ("[" * 100_000, "nested too deep"),
         ('{"time": ' + "9" * 5000 + "}", "not valid JSON|not finite"),
         ("[{]", "is not valid JSON"),

@@ -119,6 +119,7 @@ def _read_whole(path: Path) -> tuple[dict[str, Any], Generator[tuple[str, JsonEn
     content = entries = _parse(path, path.read_bytes().removeprefix(b"\xef\xbb\xbf"), 1)
     header: dict[str, Any] = {}
     if isinstance(content, dict):
+        _refuse_result(path, content)
         entries = content["entries"] if "entries" in content else _transpose(path, content)
         header = {key: value for key, value in content.items() if isinstance(value, str | int | float)}
     if not isinstance(entries, list):
@@ -126,6 +127,13 @@ def _read_whole(path: Path) -> tuple[dict[str, Any], Generator[tuple[str, JsonEn
             f'{path}: holds no list of entries; write {{"entries": [{{"time": 0.0, ...}}, ...]}} or JSON lines'
         )
     return header, (_check_object(path, entry, f"entry {number}") for number, entry in enumerate(entries, start=1))
+
+
+def _refuse_result(path: Path, content: dict[str, Any]) -> None:
+    """Refuse a file that a command wrote as its result."""
+    schema = content.get("schema")
+    if isinstance(schema, str) and schema.startswith("seaopt/"):
+        raise LogError(f'{path}: is a result ("schema": "{schema[:60]}"), and no log; give what the machine recorded')
 
 
 def _transpose(path: Path, content: dict[str, Any]) -> list[JsonEntry]:
