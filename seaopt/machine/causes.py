@@ -73,7 +73,7 @@ def find_causes(whole: Setting, match: Match, others: Others) -> tuple[tuple[Cau
     before = here.energy
     if not before:
         return (), whole
-    tried = sorted(_try_all(window, others), key=_rank)
+    tried = _keep_best(sorted(_try_all(window, others), key=_rank))
     if not tried or not tried[0][1].explains or tried[0][0].kind in FITTED:
         size = min(len(whole.ticks), MOST_ROWS)
         begin = max(0, min(middle - size // 2, len(whole.ticks) - size))
@@ -97,6 +97,15 @@ def find_causes(whole: Setting, match: Match, others: Others) -> tuple[tuple[Cau
 
 
 Tried = tuple[Alternative, Match]
+
+
+def _keep_best(ranked: Iterable[Tried]) -> list[Tried]:
+    """Return the causes, of those that are said alike the first: a feedforward that is missing, or another one."""
+    best = dict[tuple[str, str, float | None, str], Tried]()
+    for alternative, match in ranked:
+        key = (alternative.kind, alternative.what, alternative.value, alternative.unit)
+        best.setdefault(key, (alternative, match))
+    return list(best.values())
 
 
 def _look_further(

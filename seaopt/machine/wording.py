@@ -78,8 +78,8 @@ def _say_open(cause: Cause) -> str:
     return f"undecided: the log cannot tell this law from {other}; {more}"
 
 
-def say_cause(cause: Cause) -> str:
-    """Return what a cause means for who wrote the firmware."""
+def say_cause(cause: Cause, command: str) -> str:
+    """Return what a cause means for who wrote the firmware. `command`: the name of what the law returns."""
     if cause.undecided:
         return _say_open(cause)
     value = format_number(cause.value)
@@ -99,8 +99,11 @@ def say_cause(cause: Cause) -> str:
                 f"the command does not follow {cause.what}: the loop was open; let the law make the command in each "
                 "tick of what was read, and record under a reference that moves"
             )
+        case "unit" if cause.what == command:
+            return f"{cause.what} is in another unit: the logged value is {value} times what the law returned"
         case "unit":
-            return f"{cause.what} is in another unit: {value} times what it should be"
+            logged = format_number(None if cause.value is None else 1.0 / cause.value)
+            return f"{cause.what} is in another unit: the logged value is {logged} times what the law was given"
         case "factor":
             return f"{cause.what} is {value} times what it should be"
         case "gain" if cause.edited is not None:

@@ -74,7 +74,7 @@ def test_a_limit_that_the_law_is_not_told_of_is_one_cause(controller, bench):
     )
     cause = cause_of(controller, clipped)
     assert (cause.kind, cause.what, cause.value) == ("limit", "behind the law", 4.0)
-    assert "limited to 4 A behind the law, which is not told of it" in " ".join(say_cause(cause).split())
+    assert "limited to 4 A behind the law, which is not told of it" in " ".join(say_cause(cause, "I").split())
 
 
 @pytest.mark.parametrize("factor", [0.5, -1.0])

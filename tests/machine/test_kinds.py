@@ -100,7 +100,7 @@ def test_a_schedule_that_was_given_a_value_between_its_points_is_named_with_it(s
     (row,) = so.accept(schedule, [replace_place(log, np.full(REFERENCE.size, 6.5e5))]).replays
     cause = row.causes[0]
     assert cause.kind == "place" and cause.explains and cause.value == pytest.approx(6.2e5, rel=1e-3), row
-    assert not row.met and f"the law was given {cause.value:.4g} N/m as k" in say_cause(cause)
+    assert not row.met and f"the law was given {cause.value:.4g} N/m as k" in say_cause(cause, "I")
 
 
 def test_a_moving_variable_that_was_logged_with_an_offset_is_named_with_it(schedule, scheduled):
@@ -109,7 +109,7 @@ def test_a_moving_variable_that_was_logged_with_an_offset_is_named_with_it(sched
     (row,) = so.accept(schedule, [replace_place(log, places - 3e4)]).replays
     cause = row.causes[0]
     assert cause.kind == "shift" and cause.explains and cause.value == pytest.approx(3e4, rel=1e-2), row
-    assert "N/m added to what was logged" in say_cause(cause)
+    assert "N/m added to what was logged" in say_cause(cause, "I")
 
 
 @pytest.mark.parametrize(
@@ -447,7 +447,7 @@ def test_an_edited_gain_of_a_table_is_named_with_its_point_and_factor(
         found = {name: first.gains[name] / first.exported[name] for name in first.gains}
         assert first.kind == "gains" and found == pytest.approx(dict.fromkeys(found, 1.0) | gains, rel=0.01)
     said = "at all points of k" if len(points) > 1 else f"at k = {format_number(points[0])} N/m"
-    assert said in say_cause(first)
+    assert said in say_cause(first, "I")
 
 
 @pytest.mark.parametrize(
@@ -474,7 +474,7 @@ def test_two_edited_gains_of_a_table_are_named_each_with_its_points_and_factor(
         assert (None if found[name].everywhere else list(found[name].points)) == points
         where = "at all points of k" if points is None else f"at k = {format_number(points[0])} N/m"
         said = f"the gain {name} is {format_number(found[name].factor)} times what was exported {where}"
-        assert said in say_cause(first)
+        assert said in say_cause(first, "I")
 
 
 def test_an_entry_of_the_table_that_was_edited_in_the_c_is_named(schedule, compiler, tmp_path):

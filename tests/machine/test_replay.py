@@ -185,15 +185,26 @@ def test_a_law_that_is_stepped_at_another_rate_is_told_by_the_clock(controller, 
 @pytest.mark.parametrize(
     ("columns", "expected"),
     [
-        (lambda log: {"I": 1e3 * log["I"]}, ("unit", "I", 1e3)),
-        (lambda log: {"F1": 1e-3 * log["F1"]}, ("unit", "F1", 1e3)),
-        (lambda log: {"reference": -log["reference"]}, ("sign", "reference", -1.0)),
+        (lambda log: {"I": 1e3 * log["I"]}, ("unit", "I", 1e3, "the logged value is 1000 times what the law returned")),
+        (
+            lambda log: {"F1": 1e-3 * log["F1"]},
+            ("unit", "F1", 1e3, "the logged value is 0.001 times what the law was given"),
+        ),
+        (lambda log: {"reference": -log["reference"]}, ("sign", "reference", -1.0, "the sign of reference is turned")),
     ],
 )
 def test_a_column_in_another_unit_or_sign_has_its_name(controller, bench, columns, expected):
     log = bench.log(Machine(), REFERENCE)
     cause = cause_of(controller, rename(log, **columns(log)))
     assert (cause.kind, cause.what) == expected[:2] and np.isclose(cause.value, expected[2])
+    assert say_cause(cause, "I").endswith(expected[3])
+
+
+def test_no_two_causes_of_one_log_are_said_alike(controller, bench):
+    log = bench.log(Machine(), REFERENCE)
+    (row,) = so.accept(controller, [rename(log, F1=0.0 * log["F1"])]).replays
+    said = [say_cause(cause, "I") for cause in row.causes]
+    assert len(said) == len(set(said)) > 3, said
 
 
 def test_another_law_and_another_limit_are_named(compiler, tmp_path, controller):
@@ -379,7 +390,7 @@ def test_the_lines_that_would_tell_this_law_from_another_do(controller, bench, h
 
     (row,) = so.accept(controller, [play(bench, 2 * lines, 60.0)]).replays
     cause = next(cause for cause in row.causes if cause.what == what)
-    assert row.undecided and f"play a line at {cause.tells_hz:.2g} Hz" in say_cause(cause)
+    assert row.undecided and f"play a line at {cause.tells_hz:.2g} Hz" in say_cause(cause, "I")
     more = np.unique([*(2 * lines), *(round(2 * each.tells_hz) for each in row.causes if each.tells_hz)])
     scale = 60.0 * np.sqrt(more.size / lines.size)
     assert so.accept(controller, [play(bench, more, scale)]).replayed

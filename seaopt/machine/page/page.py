@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from seaopt.control import Controller
@@ -255,7 +256,7 @@ def _tell_missing(result: Acceptance) -> list[Section]:
     told = [] if result.stepped is None else [say_difference(result.stepped)]
     told += result.left_out.values()
     told += [
-        f"{source}: {say_cause(row.causes[0])}"
+        f"{source}: {say_cause(row.causes[0], result.controller.command.input)}"
         for source, row in zip(result.sources, result.replays, strict=True)
         if row.undecided
     ]
@@ -352,6 +353,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     )
     head = ("log", "verdict", "ticks", f"off (rms, {unit})", "at most", "rounding", "command", "at limit", "rate (Hz)")
     late = sorted({row.command_late for row in result.replays if row.met and row.command_late})
+    say = partial(say_cause, command=result.controller.command.input)
     remarks = tuple(
         f"The command is logged {abs(by)} row {'late' if by > 0 else 'early'}, which is allowed." for by in late
     )
@@ -385,7 +387,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         if reported is not None and (said := say_status(reported, row))
     )
     remarks += tuple(
-        f"{Path(source).name} does not exclude that {', or that '.join(map(say_cause, row.possible))}."
+        f"{Path(source).name} does not exclude that {', or that '.join(map(say, row.possible))}."
         for source, row in zip(result.sources, result.replays, strict=True)
         if row.met and row.possible
     )
@@ -413,7 +415,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
     for source, row in zip(result.sources, result.replays, strict=True):
         table = tuple(
             (
-                AND * cause.besides + say_cause(cause),
+                AND * cause.besides + say(cause),
                 f"{100.0 * cause.removes:.4g} %",
                 mark_met(cause.explains, "all", "in part"),
             )

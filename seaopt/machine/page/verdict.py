@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from seaopt.formatting import format_count, format_number, join_words
 from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.causes import Cause
@@ -262,12 +264,13 @@ def _is_untold(first: Cause, other: Cause) -> bool:
 
 def _say_off(row: Replay, result: Acceptance) -> str:
     unit = unit_after(result.controller.command.unit)
+    say = partial(say_cause, command=result.controller.command.input)
     if row.undecided:
-        return say_cause(row.causes[0])
+        return say(row.causes[0])
     if row.explained:
         first, *others = row.causes
-        untold = [say_cause(first), *(say_cause(other) for other in others if _is_untold(first, other))]
-        return say_cause(first) if len(untold) == 1 else f"{'; or '.join(untold)}: {UNTOLD}"
+        untold = [say(first), *(say(other) for other in others if _is_untold(first, other))]
+        return say(first) if len(untold) == 1 else f"{'; or '.join(untold)}: {UNTOLD}"
     off = f"the command is off by {format_number(row.mismatch, 3)}{unit} (rms), of {format_number(row.rms, 3)}{unit}"
     if row.ticks_per_row > 1:
         off = f"{off}, or lines of the reference lie above half of the log's rate"
@@ -275,5 +278,5 @@ def _say_off(row: Replay, result: Acceptance) -> str:
         return f"{off}; {MISSED}"
     first, *others = row.causes
     if others and others[0].besides and others[0].explains:
-        return f"{say_cause(first)}, and {say_cause(others[0])}"
-    return f"{off}; nearest: {say_cause(first)} ({100.0 * first.removes:.0f} % of it)"
+        return f"{say(first)}, and {say(others[0])}"
+    return f"{off}; nearest: {say(first)} ({100.0 * first.removes:.0f} % of it)"
