@@ -114,12 +114,13 @@ def accept_logs(
     certificate, broken = _find_certificate(folder, stage, path)
     result = replace(result, certificate=certificate, broken=broken, stage=stage, fit_met=session.fit_met())
     content = write(result, session, logs)
-    again = write_again(result, session)
-    if again:
-        errors.wrap(f"note: to fit these logs too, put the tables of {again[-1]} into the problem file")
-    files = [folder / FILE, folder / PAGE, *again]
-    certify = session.spell("certify" if stage is None else "bringup")
-    return _show(result, content, files, json=json, amount=amount, again=certify)
+    written = write_again(result, session)
+    if written:
+        errors.wrap(f"note: to fit these logs too, put the tables of {written[-1]} into the problem file")
+    files = [folder / FILE, folder / PAGE, *written]
+    again = session.spell("certify" if stage is None else "bringup")
+    commands = Commands(fit=session.spell("fit"), certify=again)
+    return _show(result, content, files, json=json, amount=amount, commands=commands)
 
 
 def _show(
@@ -129,14 +130,14 @@ def _show(
     *,
     json: bool,
     amount: Amount,
-    again: str = "",
+    commands: Commands,
 ) -> bool:
-    """Print a result; return whether it is met. `files`: that were written of it; `again`: what certifies its law."""
+    """Print a result; return whether it is met. `files`: that were written of it; `commands`: to type next."""
     if json:
         sys.stdout.write(to_json(content))
         return result.met
     console = Terminal()
-    verdict = judge(result, Commands(certify=again))
+    verdict = judge(result, commands)
     show_verdicts(console, [] if verdict is None else [verdict], verbose=amount == "verbose")
     if amount != "quiet":
         show_sections(console, result, verbose=amount == "verbose")
@@ -439,7 +440,8 @@ def plan_bring_up(
         command=spell_call(),
     )
     files = [target / PLAN, page, *(target / stage.name for stage in plan.stages)]
-    return _show(plan, content, files, json=json, amount=amount)
+    commands = Commands(fit=session.spell("fit"))
+    return _show(plan, content, files, json=json, amount=amount, commands=commands)
 
 
 def _slow_down(problem: Problem, fraction: float) -> Problem:

@@ -557,7 +557,8 @@ class Session:
         assert verdict is not None
         verdicts.append(verdict)
         if stage not in ("fit", "accept", "bringup") and not self.fit_met():
-            return [doubt_design(verdict) for verdict in verdicts]
+            shown = self._path("fit") in self.written  # with what comes next
+            return [doubt_design(verdict, "" if shown else commands.fit) for verdict in verdicts]
         if self.problem.refused:  # a warning that a long fit's progress has left behind
             wrong = f"{self.problem.refused}; a design refuses this"
             verdicts = [replace(each, next=(*each.next, Step(text=wrong))) for each in verdicts]

@@ -99,7 +99,7 @@ def test_a_fit_that_is_killed_as_it_is_judged_is_there_and_nobody_takes_it_for_m
     assert whole.met(["fit"]) and whole.results["fit"].parameters["J"].value == inertia["value"]
 
 
-def test_bringup_and_accept_say_that_a_fit_is_not_met(tmp_path, monkeypatch, compiler, without_simulation):
+def test_bringup_and_accept_say_that_a_fit_is_not_met(tmp_path, monkeypatch, capsys, compiler, without_simulation):
     """Both took it as met: they exited 0, and no file of theirs had a word of it."""
     monkeypatch.setattr("seaopt.cli.machine.bring_up", partial(bring_up, fractions=()))  # no slower laws are tuned
 
@@ -123,12 +123,17 @@ def test_bringup_and_accept_say_that_a_fit_is_not_met(tmp_path, monkeypatch, com
             session.run("fit")
     session = Session(problem, out)
     session.run("tune")
+    capsys.readouterr()
+    session.show(False, ["tune"])
+    remedy = f"next: fit again, and mend what that names: seaopt fit {problem} -o {out}"
+    assert remedy in " ".join(capsys.readouterr().out.split())
     log = Bench(compiler, tmp_path, session.law()).log(Machine(), multisine(1000, LINES, 8, 60.0, 3, bias=300.0))
     arguments = {"bringup": [], "accept": [str(so.write_log(log, tmp_path / "log.csv"))]}
     for command, name in (("bringup", "bringup/bringup.json"), ("accept", "acceptance.json")):
         done = run(command, *arguments[command])
         said = " ".join(done.output.split())
         assert done.exit_code == 1 and "on a fit that is not met" in said and "it is not judged" in said, said
+        assert remedy in said
         content = read(name)
         assert content["met"] is False and content["fit_met"] is False
         assert "on a fit that is not met" in (out / name).with_suffix(".html").read_text(encoding="utf-8")

@@ -82,7 +82,7 @@ def judge(result: BringUp, commands: Commands) -> Verdict | None:
     remedies = dict.fromkeys(filter(None, (find_remedy(failure.worst) for _, failure in failures)))
     text = f"Bring-up: {len(good)} of {format_count(len(result.stages), 'stage')} with a certified law"
     verdict = Verdict(met=result.met, text=text, reasons=reasons, next=tuple(Step(text=each) for each in remedies))
-    return doubt_design(verdict) if result.fit_met is False else verdict
+    return doubt_design(verdict, commands.fit) if result.fit_met is False else verdict
 
 
 OUTER = (

@@ -98,7 +98,7 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
     steps = (Step(text="certify the law:", copied=(commands.certify,)),) if missing else ()
     text = f"{name_acceptance(result)}: {'; '.join(parts)}"
     verdict = Verdict(met=result.met, text=text, reasons=tuple(reasons), next=steps)
-    return doubt_design(verdict) if result.fit_met is False else verdict
+    return doubt_design(verdict, commands.fit) if result.fit_met is False else verdict
 
 
 def name_acceptance(result: Acceptance) -> str:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.estimation import Fit
 from seaopt.reporting.sections import judge
-from seaopt.reporting.sections.data import Reason, Section, Table, Verdict, mark_met
+from seaopt.reporting.sections.data import Reason, Section, Step, Table, Verdict, mark_met
 from seaopt.robustness import Certificate, JointTuning
 from seaopt.robustness.verification.verification import Verification
 
@@ -69,9 +69,12 @@ def judge_joint(joint: JointTuning, *, certified: bool) -> Verdict:
     return Verdict(met=joint.met, text=f"Joint tuning: {joint.summary}", reasons=reasons)
 
 
-def doubt_design(verdict: Verdict) -> Verdict:
-    """Return the verdict on a design as it is where the fit that it was made with is not met."""
-    return replace(verdict, met=False, text=f"{verdict.text}, {UNMET}")
+def doubt_design(verdict: Verdict, fit: str = "") -> Verdict:
+    """Return the verdict on a design as it is where the fit that it was made with is not met. `fit`: the command that
+    fits again, where the verdict on the fit is not shown beside it.
+    """
+    again = (Step(text="fit again, and mend what that names:", copied=(fit,)),) if fit else ()
+    return replace(verdict, met=False, text=f"{verdict.text}, {UNMET}", next=(*again, *verdict.next))
 
 
 def describe_expectations(outcomes: Sequence[tuple[bool, str]]) -> list[Section]:

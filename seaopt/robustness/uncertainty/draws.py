@@ -219,7 +219,10 @@ def combine_uncertainty(
         covariance = source.total_covariance if drive is None else drive.take_covariance(source)
         nominal, names, matrix = source.parameters, covariance.names, covariance.matrix
         if source.status not in ("converged", "not_identifiable"):
-            raise ControlError(f"the fit has not converged ({source.message}); nothing can be certified from it")
+            raise ControlError(
+                f"the fit has not converged ({source.message}), so nothing can be certified; fit again (seaopt fit "
+                "PROBLEM), and mend what that names"
+            )
         for name in names:
             if name in plant_names and name not in ranges and not np.isfinite(covariance.std(name)):
                 raise ControlError(
