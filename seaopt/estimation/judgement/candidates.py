@@ -223,7 +223,8 @@ def _free_delays(problem: FitProblem, params: ParameterSet, *, poor: bool) -> It
     names = tuple(f"{e.name}.delay_s" for e in experiments)
     trials = list(zip(experiments, names, shifts, stated, strict=True))
     shifted = tuple(
-        free_delay(_lead(e, lead), value + shift) for (e, _, shift, value), lead in zip(trials, leads, strict=True)
+        free_delay(lead_inputs(e, lead), value + shift)
+        for (e, _, shift, value), lead in zip(trials, leads, strict=True)
     )
     kept = tuple(_cut_ends(e, lead) for e, lead in zip(experiments, leads, strict=True))
 
@@ -316,7 +317,7 @@ def _take_output(experiment: Experiment, output: str) -> Experiment:
     )
 
 
-def _lead(experiment: Experiment, samples: int) -> Experiment:
+def lead_inputs(experiment: Experiment, samples: int) -> Experiment:
     """Return the experiment with its inputs so many samples early, without the outputs whose inputs are not known."""
     cut, names = _cut_ends(experiment, samples), [n for n in experiment.plant.inputs if n in experiment.log.signals]
     led = {name: np.append(cut.log[name][samples:], np.repeat(cut.log[name][-1:], samples)) for name in names}

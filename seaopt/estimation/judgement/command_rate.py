@@ -5,7 +5,9 @@ delay, damping, or nothing. Two kinds of commands leave different traces.
 
 A smooth one can be had back between its rows, by a polynomial through twelve of them. With D values a row the outputs
 come (1 - 1/D) / 2 rows sooner than with one. The fit is refitted so, which takes a few iterations, and where that
-removes the excess the rate is the one that leaves the least.
+removes the excess the rate is the one that leaves the least. Inputs that are stamped late do nearly the same: refitted
+with a free shift of its rows, the logs have to be nearer to the interpolated ones than to these. Where neither is
+nearer the rate is named beside the other causes, and where the shift is it is not.
 
 Of one that changes from tick to tick, as binary noise, the rows tell nothing about what lies between them. With
 the spectrum F of what is white in the rows, and S of all of them, the outputs follow the rows at a frequency only to
@@ -19,15 +21,19 @@ command would look alike, so that other causes are still looked for, though not 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from seaopt import welch
 from seaopt.errors import SeaoptError
+from seaopt.estimation.judgement.candidates import lead_inputs
+from seaopt.estimation.judgement.causes import ENOUGH
 from seaopt.estimation.judgement.coherence import Octave, measure_octaves
+from seaopt.estimation.judgement.score_test import free_delay
 from seaopt.estimation.judgement.second_log import FAR
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
@@ -56,8 +62,10 @@ READING = ', or, where the column is a measured current, give hold = "first"'
 class UnloggedCommand:
     """What says that a command was held at a faster rate than its log's."""
 
-    finding: FitFinding
-    certain: bool  # whether a refit with the command between the rows leaves noise: nothing else is to be looked for
+    findings: tuple[FitFinding, ...]
+    # "certain": nothing else is to be looked for; "likely": hardly anything, and what leaves an excess is no cause;
+    # "possible": inputs that are stamped late explain as much
+    standing: Literal["certain", "likely", "possible"]
 
 
 def find_unlogged_command(
@@ -80,8 +88,9 @@ def find_unlogged_command(
             return _fill_rows(fit, minimum, floors, first)
         except SeaoptError:  # nothing that can be simulated, or in time
             return None
-    octaves = [o for e in minimum.problem.experiments for o in measure_octaves(e, residuals[e.name], floors[e.name])]
-    return _find_white(fit, octaves)
+    octaves = ((e.data, measure_octaves(e, residuals[e.name], floors[e.name])) for e in minimum.problem.experiments)
+    white = tuple(finding for e, each in octaves if (finding := _find_white(e, each)) is not None)
+    return UnloggedCommand(findings=white, standing="likely") if white else None
 
 
 def _list_commands(experiment: Experiment) -> list[str]:
@@ -123,12 +132,42 @@ def _fill_rows(fit: Fit, minimum: Minimum, floors: Mapping[str, NoiseFloor], fir
     left = _measure_left(problem, best, floors)
     if found is None or (left > NOISE and (left > HIGH or left > FALLS * first)):
         return None
+    shifted = _refit_late(problem, minimum.z, found)
+    nearer = 0.5 * fit.samples * (_measure_mean(shifted) - _measure_mean(best))  # of log-likelihood
+    if nearer < -ENOUGH:
+        return None
     gone = 1.0 - min(
         float(np.min((best.power[e.name].rms / np.maximum(fitted.power[e.name].rms, 1e-300)) ** 2))
         for e in problem.experiments
     )
     seen = f"with the values between interpolated {100.0 * gone:.3g} % of a residual's power is gone"
-    return UnloggedCommand(finding=_state(fit, found, seen, READING), certain=True)
+    certain = nearer > ENOUGH
+    if not certain:
+        seen += ", and as much with inputs that are stamped late"
+    findings = tuple(_state(e.data, found, seen, READING, certain=certain) for e in problem.experiments)
+    return UnloggedCommand(findings=findings, standing="certain" if certain else "possible")
+
+
+def _refit_late(problem: FitProblem, z: Vector, count: int) -> Evaluation:
+    """Return a rough minimum with the rows of each input as they are, and as much earlier or later as suits the
+    outputs: from where so many values of each would put them.
+    """
+    delays = {
+        e.name: e.period + (e.slots.delay.value if e.slots.delay.index is None else float(z[e.slots.delay.index]))
+        for e in problem.experiments
+    }
+    data = {e.name: free_delay(lead_inputs(e.data, 1), delays[e.name]) for e in problem.experiments}
+    shifted, start = problem.rebuild(problem.params, z, data)
+    start = start.copy()
+    for e in shifted.experiments:
+        start[e.slots.delay.index] = max(delays[e.name] - 0.5 * (1.0 - 1.0 / count) * e.period, 0.0)
+    shifted = copy_steps(shifted, problem)
+    return settle_roughly(shifted, shifted.evaluate(start), checked=True).solution.evaluation
+
+
+def _measure_mean(evaluation: Evaluation) -> float:
+    """Return the misfit of a sample."""
+    return measure_misfit(evaluation) / sum(float(np.sum(power.counts)) for power in evaluation.power.values())
 
 
 def _refit(problem: FitProblem, z: Vector, count: int, least: float) -> Evaluation | None:
@@ -176,7 +215,7 @@ def _measure_left(problem: FitProblem, evaluation: Evaluation, floors: Mapping[s
     return max(float(np.max(evaluation.power[name].rms / each)) for name, each in noise.items())
 
 
-def _find_white(fit: Fit, octaves: list[Octave]) -> UnloggedCommand | None:
+def _find_white(experiment: Experiment, octaves: Iterable[Octave]) -> FitFinding | None:
     """Return the finding of commands that change from tick to tick: from octaves in which noise is little and the rows
     are white.
     """
@@ -193,17 +232,17 @@ def _find_white(fit: Fit, octaves: list[Octave]) -> UnloggedCommand | None:
         f"alike at all frequencies from {low:.3g} to {high:.3g} Hz, {100.0 * share:.2g} % of the outputs' power "
         "follows no row of it, as if a random force as large acted on the motor"
     )
-    return UnloggedCommand(finding=_state(fit, max(round(1.0 / (1.0 - share)), 2), seen), certain=False)
+    return _state(experiment, max(round(1.0 / (1.0 - share)), 2), seen)
 
 
-def _state(fit: Fit, count: int, seen: str, besides: str = "") -> FitFinding:
-    logged_hz = 1.0 / fit.experiments[0].log.period
+def _state(experiment: Experiment, count: int, seen: str, besides: str = "", *, certain: bool = True) -> FitFinding:
+    logged_hz = 1.0 / experiment.log.period
     return FitFinding(
-        severity="error",
+        severity="error" if certain else "warning",
         kind="command",
-        where=", ".join(each.name for each in fit.experiments),
-        text=f"the command was held at a faster rate than the {logged_hz:.4g} Hz of the log: at about "
-        f"{count * logged_hz:.4g} Hz, {count} values for each that is logged ({seen}); log every tick, or command at "
-        f"the log's rate{besides}",
+        where=experiment.name,
+        text=f"the command {'was' if certain else 'may have been'} held at a faster rate than the {logged_hz:.4g} Hz "
+        f"of the log: at about {count * logged_hz:.4g} Hz, {count} values for each that is logged ({seen}); log every "
+        f"tick, or command at the log's rate{besides}",
         rate_hz=count * logged_hz,
     )

@@ -117,10 +117,10 @@ def judge(
     fit = replace(fit, silent=find_silent(fit, freed))
     with limit_evaluations(TESTS * evaluations):
         command = find_unlogged_command(fit, residuals, floors, error.excess)
-    known = command is not None and command.certain  # what is wrong
+    standing = None if command is None else command.standing
     testing(f"trying another start, at most {evaluations} evaluations", 0.5)
     with limit_evaluations(TESTS * evaluations):
-        another = [] if known else list(find_other_minimum(fit))
+        another = [] if standing == "certain" else list(find_other_minimum(fit))
     findings = [
         *_find_unexplained(fit, shares, error.excess),
         *_find_held_out(fit),
@@ -136,18 +136,21 @@ def judge(
         *find_single_event((*fit.experiments, *(each for each in validation if _tells(fit, each))), minimum),
         *another,
     ]
-    if command is not None and known:
-        return _conclude(replace(fit, findings=order_findings([*findings, command.finding, *find_step_error(fit)])))
+    commanded = () if command is None else command.findings
+    if standing == "certain":
+        return _conclude(replace(fit, findings=order_findings([*findings, *commanded, *find_step_error(fit)])))
     suspects = {name: test for name, test in _run_tests(fit, minimum, freed).items() if test.p < DOUBTFUL}
-    if command is not None:
+    if standing == "likely":
         evaluations = EVALUATIONS  # what brings a random force is hardly among the causes
     budget = EvaluationBudget.begin((OF_HYPOTHESES + OF_CAUSES) * evaluations, minimum.problem.count_work(minimum.z))
     with budget.enforce():
         fit, findings, search = _search_causes(
             fit, findings, residuals, floors, error, suspects, alternatives, budget, evaluations, trying
         )
-    if command is not None and not any(refit.excess <= REMOVED for refit in search.able):
-        findings = [*(each for each in findings if each.kind != "cause"), command.finding]
+    if standing == "possible":
+        findings += commanded
+    elif standing == "likely" and not any(refit.excess <= REMOVED for refit in search.able):
+        findings = [*(each for each in findings if each.kind != "cause"), *commanded]
         search = search.yield_to_another()
     findings += find_step_error(fit)  # at last, for no cause explains it
     return _conclude(replace(fit, findings=order_findings(findings), hypotheses=search.trials))

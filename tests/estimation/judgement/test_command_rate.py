@@ -5,6 +5,8 @@ The actuators are integrated here at the command's own rate, in NumPy, and rows 
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -29,19 +31,32 @@ def play_binary(ticks=1):
     return np.repeat(steps, ticks)
 
 
-def record(current, every, *, rate_hz=TICK_HZ, missing=0.0, **options):
-    """Return the fit of every so many rows of a locked knee, the evaluations before its judgement, and all."""
-    truth = KNEE | {"f_c": missing}
-    columns = knee(current, rate_hz, locked=True, **truth)
-    time = np.arange(current.size) / rate_hz
-    log = so.Log.from_arrays(time=time[::every], **{n: columns[n][::every] for n in ("I", "tau_s", "theta_m")})
+def make_log(current, every, *, rate_hz=TICK_HZ, missing=0.0, later=0, noise=1.0):
+    """Return every so many rows of a locked knee, its outputs so many of them later than the command."""
+    columns = knee(current, rate_hz, locked=True, noise=noise, **KNEE | {"f_c": missing})
+    rows = np.arange(0, current.size - later, every)
+    outputs = {name: columns[name][rows + later] for name in ("tau_s", "theta_m")}
+    return so.Log.from_arrays(time=rows / rate_hz, I=columns["I"][rows], **outputs)
+
+
+def fit_logs(*logs, **options):
+    """Return a fit, the evaluations before its judgement, and all."""
     plant = so.plants.rotary(link="locked")
     known = {name: KNEE[name] for name in ("J_m", "b_r", "k_s", "N", "K_tau")}
     params = plant.defaults.update(**known | {"c_s": 0.0, "J_m": 3e-5, "b_r": 2e-4, "k_s": 260.0}).free(*FREE)
-    experiment = so.Experiment(plant=plant, log=log, outputs=("tau_s", "theta_m"), **options)
+    names = [f"log-{number}" for number in range(len(logs))] if len(logs) > 1 else ["experiment"]
+    outputs = ("tau_s", "theta_m")
+    experiments = [
+        so.Experiment(plant=plant, log=log, name=name, outputs=outputs, **options)
+        for name, log in zip(names, logs, strict=True)
+    ]
     kept, before = [], count_evaluations()
-    fit = so.fit([experiment], params, keep=lambda _: kept.append(count_evaluations() - before))
+    fit = so.fit(experiments, params, keep=lambda _: kept.append(count_evaluations() - before))
     return fit, kept[0], count_evaluations() - before
+
+
+def record(current, every, *, missing=0.0, **options):
+    return fit_logs(make_log(current, every, missing=missing), **options)
 
 
 def list_rates(fit):
@@ -89,3 +104,33 @@ def test_a_log_that_has_all_that_was_commanded_is_met(play, every):
 def test_friction_that_the_model_lacks_is_no_command_between_the_rows(play):
     fit, _, _ = record(play(), 1, missing=0.02)
     assert not list_rates(fit)
+
+
+@pytest.mark.parametrize("part", [4, 3])
+def test_readings_taken_a_part_of_a_tick_after_the_command_are_that(part):
+    """Two values a row move the outputs by a quarter of a row, too: that was named, and nothing else looked for."""
+    current = np.repeat(play_multisine(), 12)  # held over the whole tick
+    fit, _, _ = fit_logs(make_log(current, 12, rate_hz=12 * TICK_HZ, later=12 // part))
+    assert not fit.met
+    assert not [each for each in fit.errors if each.kind == "command"]
+    (cause,) = (each.text for each in fit.findings if each.kind == "cause")
+    (late, *_) = re.findall(r"stamped ([0-9.]+) ms late", cause)
+    assert float(late) == pytest.approx(1.0 / part, abs=0.01)
+
+
+def test_where_a_late_stamp_explains_as_much_both_are_named():
+    """Under so much noise steps of 1 and of 2 ms, a quarter of these apart, do not differ."""
+    fit, _, _ = fit_logs(make_log(play_multisine(), 2, noise=5.0))
+    (finding,) = (each for each in fit.findings if each.kind == "command")
+    assert (finding.severity, finding.rate_hz) == ("warning", TICK_HZ)
+    assert "may have been held" in finding.text and "as much with inputs that are stamped late" in finding.text
+    (cause,) = (each.text for each in fit.findings if each.kind == "cause")
+    assert "late" in cause
+
+
+@pytest.mark.parametrize("play", [play_multisine, play_binary])
+def test_each_log_has_a_rate_of_its_own(play):
+    slow = make_log(np.repeat(play()[::2], 2), 4)
+    fit, _, _ = fit_logs(make_log(play(), 2), slow)
+    rates = {each.where: each.rate_hz for each in fit.findings if each.kind == "command"}
+    assert rates == {"log-0": TICK_HZ, "log-1": TICK_HZ / 2}
