@@ -103,6 +103,10 @@ class ControlError(SeaoptError):
     """A controller specification is contradictory or out of range."""
 
 
+class RunawayError(ControlError):
+    """A closed loop grows beyond what a computer has numbers for."""
+
+
 class ProblemError(SeaoptError):
     """A problem file is not valid."""
 

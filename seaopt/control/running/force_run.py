@@ -31,7 +31,7 @@ from seaopt.control.loops.sampled_plant import (
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RTOL, STICKING_RTOL
 from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, advance_function, observe_function
 from seaopt.control.running.sampled_loop import channel_names, largest_command
-from seaopt.errors import ControlError, StepSizeError, require_seed
+from seaopt.errors import ControlError, RunawayError, StepSizeError, require_seed
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
 from seaopt.plants.memo import memo
@@ -320,7 +320,7 @@ class _Integrator:
                 break
             self.substeps, self.ends = 2 * self.substeps, None
         if not np.all(np.isfinite(fine)):
-            raise ControlError(f"the loop on {self.plant.name} runs away at t = {t:g} s; tune it again")
+            raise RunawayError(f"the loop on {self.plant.name} runs away at t = {t:g} s; tune it again")
         raise StepSizeError(
             f"plant {self.plant.name}: {2 * self.substeps} steps per sample leave an error of {error:.1e} of a state "
             f"at t = {t:g} s (rtol = {self.rtol:g}); check the parameters and that the loop does not run away, smooth "

@@ -18,7 +18,7 @@ from seaopt.control import Controller, ForceMPC
 from seaopt.control.laws.friction import LimitCycle, predict_limit_cycles
 from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import at_rest, run_loop
-from seaopt.errors import ControlError, SimulationError
+from seaopt.errors import RunawayError, SimulationError
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -130,7 +130,7 @@ def _simulate(
             force = run.outputs[controller.spec.regulated][0]
     except SimulationError as error:
         return FoundCycle(predicted=cycle, not_simulated=str(error))
-    except ControlError:  # a plan's loop that runs away is refused
+    except RunawayError:
         return FoundCycle(predicted=cycle, runs_away=True)
     if not np.all(np.isfinite(force)):
         return FoundCycle(predicted=cycle, runs_away=True)
@@ -138,6 +138,7 @@ def _simulate(
     line = find_oscillation(end, period, floor=FLOOR * cycle.force_N, lowest_hz=0.3 * cycle.frequency_hz)
     if line is None or not line.sustained:
         first, last = (float(np.max(np.abs(half))) for half in np.array_split(end, 2))
-        return FoundCycle(predicted=cycle, runs_away=last > max(STEADY * first, cycle.force_N))  # also if it is no line
+        growing = (line is not None and line.growing) or last > max(STEADY * first, cycle.force_N)  # though no line
+        return FoundCycle(predicted=cycle, runs_away=growing)
     simulated = SimulatedCycle(force_N=line.amplitude, frequency_hz=line.frequency_hz)
     return FoundCycle(predicted=cycle, simulated=simulated)

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import seaopt as so
 from seaopt.control import close_loop
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
-from seaopt.errors import ControlError, SimulationError
+from seaopt.errors import ControlError, RunawayError, SimulationError
 from tests.control.running.test_closed_loop import delayed, law, swing_by_hand
 
 
@@ -134,5 +134,5 @@ def test_what_is_refused(swing, thor, changes, error, words):
 
 
 def test_a_loop_that_runs_away_is_told(stand, thor):
-    with pytest.raises(ControlError, match="runs away at t = "):
+    with pytest.raises(RunawayError, match="runs away at t = "):
         close_loop(lambda s, r, y: (1e3 * (r - y), s), None, stand, thor, np.full(400, 80.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -12,7 +13,7 @@ import seaopt as so
 from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.laws.friction import describe_friction, predict_limit_cycles
 from seaopt.control.laws.plausibility import PlausibilityGate
-from seaopt.errors import SimulationError
+from seaopt.errors import ControlError, SimulationError
 from seaopt.plants.friction import friction_states
 from seaopt.plants.roles import Friction
 from seaopt.robustness import linear_controller
@@ -92,6 +93,34 @@ def test_a_cycle_whose_simulation_fails_is_still_predicted(blind, monkeypatch):
     assert found.not_simulated == "the integration does not end"
     assert "the integration does not end" in str(found)
     assert not replace(found, predicted=replace(found.predicted, stable=False)).lasts
+
+
+def test_an_oscillation_that_grows_below_the_predicted_one_does_not_die_out(blind, monkeypatch):
+    """It was held to, though 20 % of the force grew to 84 % of it."""
+    plant = third_order_lag(1e3)
+    spec = so.ControllerSpec(measured="v", bandwidth_hz=25)
+    open_loop = replace(blind, law=laws.law_of([0.0]), spec=spec, design=(plant, so.ParameterSet()))
+    (cycle,) = predict_limit_cycles(open_loop, plant, so.ParameterSet())
+
+    def grow(loop, params, reference, **options):
+        time = open_loop.sample_time_s * np.arange(reference.size)
+        size = 0.2 * cycle.force_N * np.exp(np.log(4.2) * time / time[-1])
+        return SimpleNamespace(outputs={"v": (size * np.sin(2 * np.pi * cycle.frequency_hz * time))[None]})
+
+    monkeypatch.setattr("seaopt.robustness.verification.limit_cycles.run_loop", grow)
+    (found,) = seek_limit_cycles(open_loop, plant, so.ParameterSet())
+    assert found.runs_away and found.lasts
+
+
+def test_what_a_plan_is_refused_for_is_no_oscillation_that_grows(planned, stand, monkeypatch):
+    mpc, params = planned
+
+    def refuse(*args, **options):
+        raise ControlError("no such signal")
+
+    monkeypatch.setattr("seaopt.robustness.verification.playback.close_loop", refuse)
+    with pytest.raises(ControlError, match="no such signal"):
+        seek_limit_cycles(linear_controller(mpc), stand, params, plan=mpc)
 
 
 def test_the_describing_function_is_the_declared_curves(thor):
