@@ -15,7 +15,7 @@ from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.problem.stages import fit_problem
 from seaopt.reporting.sections import judge
 from seaopt.reporting.sections.data import Commands
-from seaopt.reporting.sections.kinds.fit import _list_cures
+from seaopt.reporting.sections.kinds.fit import _list_cures, spell_cure
 from tests.actuator_logs import write_csv
 from tests.estimation.judgement.test_late_or_damped import DAMPER, record
 
@@ -96,11 +96,11 @@ def test_each_plant_keeps_its_own_parts():
     assert values.copied == ("c_k = { value = 600, free = true }",)
 
 
-def test_a_cure_keeps_the_bounds_that_a_parameter_has():
+def test_a_cure_keeps_the_bounds_and_the_prior_that_a_parameter_has():
     """The line takes the place of the parameter's own, with which its bound would go: the next fit went beyond it."""
     plant = so.plants.rotary(link="locked")
     params = plant.complete(so.ParameterSet())
-    bounded = replace(params["eta"], value=0.8, max=1.0)
+    bounded = replace(params["eta"], value=0.8, max=1.0, prior_std=0.05)
     cause = FitFinding(
         severity="error", kind="cause", where="tau_s", text="", preferred={"eta": (0.9, 0.01), "J_m": (2e-4, 1e-6)},
         together=("eta", "J_m"),
@@ -110,4 +110,22 @@ def test_a_cure_keeps_the_bounds_that_a_parameter_has():
         experiments=(SimpleNamespace(plant=plant),),
     )  # fmt: skip
     (advice,) = _list_cures(fit, {"held": ()})
-    assert advice.copied == ("eta = { value = 0.9, free = true, max = 1 }", "J_m = { value = 0.0002, free = true }")
+    assert advice.copied == (
+        "eta = { value = 0.9, free = true, max = 1, prior_std = 0.05 }",
+        "J_m = { value = 0.0002, free = true }",
+    )
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [{"max": 0.123456}, {"max": 0.1234560789}, {"min": 0.123456}, {"min": 0.1, "max": 0.2, "prior_std": 0.0123456789}],
+)
+def test_a_cure_is_read_back_within_the_bounds_that_it_keeps(kept, tmp_path):
+    """0.1235 with a bound of 0.123456 was refused, and a bound of more digits was rounded."""
+    _, line = spell_cure("eta", 0.123456, kept)
+    path = tmp_path / "p.toml"
+    machine = '[plant.stand]\nkind = "high_impedance"\n[controller]\nplant = "stand"\nbandwidth_hz = 30\n'
+    path.write_text(f'schema = 1\ntitle = "x"\n[parameters]\n{line}\n{machine}')
+    eta = so.read_problem(path).parameters["eta"]
+    assert eta.value == pytest.approx(0.123456, rel=1e-3) and eta.free
+    assert {name: getattr(eta, name) for name in kept} == kept

@@ -262,7 +262,7 @@ def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[Step]
             added.update(dict.fromkeys(trials[name].parts))
             table, rows = PARAMETERS, spell_parameters(trials[name].frees, trials[name].fixed)
         else:
-            table, *rows = spell_cure(name, value, _list_bounds(fit, name)) or [PARAMETERS]
+            table, *rows = spell_cure(name, value, _list_kept(fit, name)) or [PARAMETERS]
         places.setdefault(table, {}).update(dict.fromkeys(rows))
     if not plants:
         recipes = [experiment.plant.recipe for experiment in fit.experiments[:1]]
@@ -281,28 +281,37 @@ def _write_under(table: str, rows: Iterable[str]) -> Step:
     return Step(text=f"write under {table}, in place of a line of that name if there is one:", copied=tuple(rows))
 
 
-def _list_bounds(fit: Fit, name: str) -> dict[str, float]:
-    """Return the bounds of a parameter that are closer than those of its plant, which its new line would lose."""
+def _list_kept(fit: Fit, name: str) -> dict[str, float]:
+    """Return what a parameter's new line would lose: bounds that are closer than those of its plant, and a prior."""
     plants = (experiment.plant.parameters for experiment in fit.experiments)
     declared, stated = next((each[name] for each in plants if name in each), None), fit.parameters.get(name)
     if not isinstance(declared, Parameter) or stated is None:
         return {}
     closer = {"min": stated.min > declared.min, "max": stated.max < declared.max}
-    return {end: getattr(stated, end) for end, is_closer in closer.items() if is_closer}
+    kept = {end: getattr(stated, end) for end, is_closer in closer.items() if is_closer}
+    return kept if stated.prior_std is None else {**kept, "prior_std": stated.prior_std}
 
 
-def spell_cure(name: str, value: float, bounds: Mapping[str, float] | None = None) -> list[str]:
-    """Return the place in a problem file and the line there that frees what a log would have otherwise, within the
-    bounds that it has; nothing where there is no such line.
+def spell_cure(name: str, value: float, kept: Mapping[str, float] | None = None) -> list[str]:
+    """Return the place in a problem file and the line there that frees what a log would have otherwise, with its bounds
+    and its prior, which are `kept`; nothing where there is no such line.
     """
     *experiment, parameter = name.split(".")
     if not experiment:
-        rows = {"value": f"{value:.4g}", "free": "true"} | {end: f"{at:.6g}" for end, at in (bounds or {}).items()}
+        numbers = dict(kept or {})
+        inside = min(max(float(f"{value:.4g}"), numbers.get("min", -math.inf)), numbers.get("max", math.inf))
+        rows = {"value": _spell(inside), "free": "true"} | {key: _spell(each) for key, each in numbers.items()}
         return [PARAMETERS, f"{parameter} = {{ {', '.join(f'{key} = {each}' for key, each in rows.items())} }}"]
     if parameter == "delay_s" and value > 0.0:
         settings = f"value = {value:.4g}, free = true, max = {DELAY_ROOM * value:.2g}"
         return [f"[[experiment]] {experiment[0]}, beside its log", f"delay_s = {{ {settings} }}"]
     return []
+
+
+def _spell(number: float) -> str:
+    """Return a number with all of its digits."""
+    short = f"{number:.6g}"
+    return short if float(short) == number else repr(float(number))
 
 
 def _remark(parameter: Parameter) -> str:
