@@ -21,7 +21,7 @@ from seaopt.control.running.closed_loop import LoopRun, LoopState, SampledLoop, 
 from seaopt.control.running.equilibrium import Equilibrium, equilibrium
 from seaopt.control.running.law_step import find_faults
 from seaopt.control.running.sampled_loop import channel_names, find_longest_delay
-from seaopt.errors import ControlError, StepSizeError, require_memory, require_seed
+from seaopt.errors import ControlError, SimulationError, StepSizeError, require_memory, require_seed
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import CompletedParameters, Plant, Port
@@ -232,20 +232,24 @@ def _play_plan(
         resting = not (start.force[run] or start.rest_command[run] or start.reference[run])
         wanted.append(offset[run, 0] + per_force * given)
         steps = list[PlanSample]()
-        played = run_plan(
-            plan,
-            rig.plant,
-            each,
-            wanted[-1],
-            steps,
-            start=None if resting else rest_plan(plan, rig.plant, each, start, run),
-            sensors=rig.sensors,
-            command_step=rig.command_step,
-            seed=seed,
-            start_state=start.state.x[run],
-            start_command=float(start.rest_command[run]),
-            sticks=scenario.friction == "sticking" and can_stick(rig.plant),
-        )
+        try:
+            played = run_plan(
+                plan,
+                rig.plant,
+                each,
+                wanted[-1],
+                steps,
+                start=None if resting else rest_plan(plan, rig.plant, each, start, run),
+                sensors=rig.sensors,
+                command_step=rig.command_step,
+                seed=seed,
+                start_state=start.state.x[run],
+                start_command=float(start.rest_command[run]),
+                sticks=scenario.friction == "sticking" and can_stick(rig.plant),
+            )
+        except SimulationError as error:
+            error.run = run
+            raise
         runs.append(played)
         ended.append(steps[-1])
     outputs = {name: np.stack([run.outputs[name] for run in runs]) for name in names}

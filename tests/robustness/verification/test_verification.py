@@ -11,10 +11,11 @@ import pytest
 
 import seaopt as so
 from seaopt.bench import Chirp
-from seaopt.control import Gains
+from seaopt.control import Gains, MPCSpec, force_mpc
 from seaopt.control.laws.realisation import runnable
-from seaopt.errors import ControlError
+from seaopt.errors import ControlError, UnplayedError
 from seaopt.reporting.sections.kinds.verification import describe_tracking
+from seaopt.robustness import linear_controller
 from seaopt.robustness.verification.large_signal import large_signal
 from seaopt.robustness.verification.oscillation import find_oscillation
 from seaopt.robustness.verification.playback import Rig, _build_reference, play
@@ -285,3 +286,21 @@ def test_a_chirp_needs_its_phase(controller, stand, thor):
 def test_a_phase_that_does_not_fit_in_memory_is_refused():
     with pytest.raises(ControlError, match=r"phase: duration_s = 1e\+09 takes about .* GB of memory"):
         _build_reference(Phase(duration_s=1e9, force_N=1.0), 1e-3, np.random.default_rng(0))
+
+
+def test_of_predictive_control_the_draw_that_cannot_be_simulated_is_named(stand, thor):
+    """The nominal machine was named, whatever draw it was."""
+    mpc = force_mpc(stand, thor, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
+    stuck = thor.update(f_c=500.0, v_s=1e-9)
+    scenarios = (Scenario(name="step", phases=(Phase(duration_s=0.2, force_N=20.0),)),)
+    with pytest.raises(UnplayedError) as failed:
+        verify(
+            linear_controller(mpc),
+            {"stand": stand},
+            thor,
+            draws={"stand": [thor, stuck]},
+            plan=mpc,
+            scenarios=scenarios,
+        )
+    assert failed.value.draw == "2"
+    assert failed.value.parameters == {"f_c": 500.0, "v_s": 1e-9}
