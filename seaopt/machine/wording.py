@@ -220,6 +220,11 @@ def say_drift(drift: Drift, command: str) -> str:
     """Return by how much a reading drifts beside what, and what would tell which of both it is. `command`: its name."""
     size = f"{format_number(abs(drift.value), 3)}{unit_after(drift.unit)} in {format_number(drift.lasts_s, 3)} s"
     said = f"{drift.name} drifts by {size} beside {drift.beside}"
+    if drift.beside != command and not drift.of_reading:
+        return (
+            f"{drift.beside} drifts by {size} beside {drift.name}, which the command or another sensor goes with: the "
+            f"zero of {drift.beside} moves, not that of {drift.name}; tare, and record again"
+        )
     if drift.beside != command:
         return f"{said}, while the reference repeats: the zero of one of both sensors moves; tare, and record again"
     if not drift.of_reading:

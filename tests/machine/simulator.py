@@ -93,13 +93,14 @@ class Bench:
 
     def log(self, machine, reference, *, noise=2.0, seed=1, period=None, decimals=None, places=None, drift=0.0):
         """Return the log of a run: the law's clock is `period`, its sample time if left out; `places`: of a schedule,
-        its variable in each tick; `drift`: of the sensor, per second.
+        its variable in each tick; `drift`: of the sensor, per second, or by how much it is off in each tick.
         """
         law = self.controller
         period = period or (law.table if isinstance(law, ScheduledController) else law).sample_time_s
         n = reference.size
         reference = np.ascontiguousarray(reference, dtype=float)
-        errors = noise * np.random.default_rng(seed).normal(size=n) + drift * period * np.arange(n)
+        creep = drift * period * np.arange(n) if np.ndim(drift) == 0 else drift
+        errors = noise * np.random.default_rng(seed).normal(size=n) + creep
         place, force, current = np.zeros(n) if places is None else places.copy(), np.zeros(n), np.zeros(n)
         numbers = (ctypes.c_double * len(fields(machine)))(*(getattr(machine, f.name) for f in fields(machine)))
         pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (reference, errors, place, force, current)]

@@ -15,8 +15,9 @@ from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.differences.drift import find_drifts
 from seaopt.machine.page.page import write_acceptance_page
 from seaopt.machine.ticks import take_ticks
+from seaopt.machine.wording import say_drift
 from tests.machine.conftest import FRICTION, make_dry
-from tests.machine.simulator import Machine, multisine
+from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
 
 PERIOD, LASTS = 1000, 11.0  # s, of the periods that are judged
@@ -61,6 +62,44 @@ def test_an_encoder_tells_the_drift_of_a_sensor(controller, bench, drift):
     assert all(each.low < drift * LASTS < each.high for each in found), found
 
 
+TIME = np.arange(REFERENCE.size) / PERIOD  # s
+ZEROS = {  # N, and the size as far as the means over the periods tell
+    "jumps at a period's edge": (100.0 * (TIME >= 6.0), 100.0),
+    "jumps within a period": (100.0 * (TIME > 6.4), 100.0),
+    "jumps by little": (12.0 * (TIME >= 6.0), 12.0),
+    "warms up": (30.0 * (1.0 - np.exp(-TIME / 2.0)), 30.0 * 2.0 * (1.0 - np.exp(-0.5)) * (np.exp(-0.5) - np.exp(-5.5))),
+    "goes out and back": (60.0 * np.sin(np.pi * TIME / 12.0) ** 2, 58.0),
+}
+
+
+@pytest.mark.parametrize("kind", ZEROS)
+def test_a_zero_that_moves_by_no_line_is_refused_with_its_size(controller, bench, kind):
+    """It was met: of a line that does not fit, its own residuals hide any slope."""
+    off, size = ZEROS[kind]
+    log = bench.log(RIGHT, REFERENCE, noise=0.2, drift=off)
+    (alone,), beside = find(controller, log), find(controller, with_encoder(log, log["F1"] - off))
+    assert [each.beside for each in beside] == ["q", "I"], beside
+    for each in (alone, *beside):
+        assert each.of_reading and 2.0 <= each.lasts_s <= LASTS, each
+        assert each.value == pytest.approx(size if each.value > 0.0 else -size, rel=0.04), each
+    result = so.accept(controller, [log])
+    assert not result.met and result.differences.drifts == (alone,), result
+
+
+@pytest.mark.parametrize("rate", [1.0, 6.0])
+def test_an_encoder_that_creeps_refuses_nothing(controller, bench, rate):
+    """It was refused, though the law does not read it, and the command goes with the reading."""
+    log = bench.log(RIGHT, REFERENCE[: 12 * PERIOD if rate == 1.0 else 4 * PERIOD], noise=0.2)
+    (drift,) = find(controller, with_encoder(log, log["F1"] + rate * log.time))
+    assert (drift.beside, drift.of_reading) == ("q", False), drift
+    if rate != 1.0:
+        return
+    assert drift.low < -rate * LASTS < drift.high, drift
+    result = so.accept(controller, [with_encoder(log, log["F1"] + rate * log.time)])
+    assert result.differences.drifts == (drift,) and result.differences.inside and result.response.met, result
+    assert "q drifts by 11 N in 11 s beside F1" in say_drift(drift, "I"), drift
+
+
 def test_a_drive_that_drifts_leaves_a_reading_that_an_encoder_goes_with(controller, bench):
     """Without the encoder nothing tells which of both it is."""
     machine = replace(RIGHT, drive_drift=0.01)
@@ -80,6 +119,38 @@ def test_a_drift_is_told_beside_dry_friction(compiler, tmp_path):
         found = find(bench.controller, log)
         assert len(found) == (drift > 0.0), found
         assert all(each.low < drift * each.lasts_s < each.high for each in found), found
+
+
+@pytest.mark.parametrize("share", [1.0, 0.05])
+def test_a_jump_is_told_beside_dry_friction_by_an_encoder_or_its_size(compiler, tmp_path, share):
+    """Beside the command alone one of less than four times the friction is as of a motor that it holds."""
+    bench, reference = make_dry(compiler, tmp_path, periods=4)
+    machine = replace(RIGHT, coulomb=FRICTION, smoothing=5e-4)
+    # at 13.4 s no period is judged: another set of phases begins, which has another offset beside the command
+    for size, at, told in ((0.0, 11400, []), (40.0, 11400, ["q"]), (40.0, 13400, ["q"]), (250.0, 11400, ["q", "I"])):
+        off = size * (np.arange(reference.size) >= at)
+        log = bench.log(machine, share * reference, noise=0.5, drift=off)
+        found = find(bench.controller, with_encoder(log, log["F1"] - off))
+        assert [each.beside for each in found] == told and all(each.of_reading for each in found), (size, found)
+
+
+@pytest.mark.parametrize("eta", [0.8, 1.0, 1.2])
+def test_no_drift_is_seen_where_friction_holds_a_knee(compiler, tmp_path, observed, eta):
+    """Its command hunts by up to twice the friction, while the noise within most periods is small."""
+    law, machine = observed
+    bench, loose = Bench(compiler, tmp_path, law), Machine.of_knee(law.design[1])
+    for seed, (share, bias, friction, smoothing) in enumerate(
+        (share, bias, friction, smoothing)
+        for share in (1.0, 0.2, 0.02)
+        for bias in (0.0, 2.0, 10.0)
+        for friction, smoothing in ((0.5, 1.0), (1.5, 0.02))
+    ):
+        reference = multisine(PERIOD, LINES, 12 if seed % 2 else 30, 10.0 * share, seed, bias=bias)
+        knee = replace(
+            machine, per_ampere=eta * loose.per_ampere, coulomb=friction * loose.coulomb,
+            smoothing=smoothing * loose.smoothing,
+        )  # fmt: skip
+        assert not find(law, bench.log(knee, reference, noise=0.02, seed=seed)), (share, bias, friction, smoothing)
 
 
 @pytest.mark.parametrize("dry", [False, True])

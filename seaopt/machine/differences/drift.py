@@ -3,13 +3,19 @@ r"""A reading that drifts while the loop holds it to its reference, so that the 
 The lines of a period tell nothing of its mean, and the law holds the mean of the reading to that of the reference. What
 else knows the force moves: the command, whose static effort is the force at the spring, whatever the motor rubs, and
 sensors that were logged besides, such as an encoder of the deflection. With :math:`\bar y_p, \bar b_p` the means over
-the periods, :math:`\kappa` the ratio that the model has of both at rest, :math:`t_p` the time, and an offset
-:math:`o_s` of each set of phases, which dry friction makes,
+the periods, :math:`\kappa` the ratio that the model has of both at rest, :math:`z_p` how far a zero has moved, and an
+offset :math:`o_s` of each set of phases, which dry friction makes (without it, of each mean that the reference has),
 
-.. math:: \bar y_p - \kappa \bar b_p = o_{s(p)} + a t_p + e_p .
+.. math:: \bar y_p - \kappa \bar b_p = o_{s(p)} + z_p + e_p .
 
-The reference is the same in all periods of a set, so that neither a gain that is another one nor friction makes a slope
-a; its std is that of the e. A slope that is sure, and more over the log than a machine may be off by, is a drift.
+The reference is the same in all periods of a set, so that neither a gain that is another one nor friction makes a z.
+It is looked for in two ways. Of a slow drift, :math:`z_p = a t_p`, whose std is that of what the line leaves. Of any
+other, such as a jump, as the largest difference between two means of one offset, of all pairs at once (Bonferroni). The
+std of a mean is there that of the noise within the periods, at their lowest lines without what repeats: the median of
+the periods, which a zero that moves once leaves alone. Friction that holds a motor lets the command go to and fro
+without the force; beside it, a difference counts beyond that.
+
+What is sure, and more than a machine may be off by, is a drift: of the reading, where nothing surely goes with that.
 """
 
 from __future__ import annotations
@@ -18,17 +24,21 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from seaopt.control import Controller, sample
 from seaopt.machine.differences.comparison import TOLERATED
 from seaopt.machine.response.periods import list_periods
+from seaopt.machine.response.verdicts import find_friction
 from seaopt.machine.ticks import Ticks
 from seaopt.plants.friction import take_sliding
 from seaopt.records import record
 
 SLOW = 1e-3, 1e-2  # Hz: where a static gain is the same at both
 RISK = 1e-4  # that noise is taken for a drift
+HELD = 4.0  # times the dry friction: the motor rests anywhere within twice that, and a machine may have twice as much
+SAME_LEVEL = 1e-3  # of the largest reference: means that are one
+LINES = 5  # of a period, the lowest, whose noise is that of its mean
 
 
 @record
@@ -43,7 +53,37 @@ class Drift:
     high: float
     unit: str
     lasts_s: float  # in which it does
-    of_reading: bool  # whether the reading may be what drifts: no other sensor goes with it
+    of_reading: bool  # whether the reading may be what drifts: neither another sensor nor the command goes with it
+
+
+@record(eq=False)
+class Means:
+    """Means over periods of what a reading is off by."""
+
+    first: Int[np.ndarray, " p"]  # row of each period
+    mean: Float[np.ndarray, " p"]
+    sets: Bool[np.ndarray, "p s"]  # those of one set of phases
+    levels: Bool[np.ndarray, "p l"]  # those of one mean of the reference
+    period: int  # rows
+    std: float  # of a mean, by the noise within the periods
+    free: int  # degrees of freedom of that, for its median tells less than a mean by a half
+
+
+@record
+class Change:
+    """A change of the means, how sure it is, and within how many rows."""
+
+    value: float
+    reach: float
+    rows: int
+
+    @property
+    def least(self) -> float:
+        """The least that it may be."""
+        return abs(self.value) - self.reach
+
+
+UNKNOWN = Change(value=0.0, reach=math.inf, rows=0)
 
 
 def find_drifts(controller: Controller, logs: Sequence[Ticks]) -> tuple[Drift, ...]:
@@ -53,22 +93,28 @@ def find_drifts(controller: Controller, logs: Sequence[Ticks]) -> tuple[Drift, .
 
 def _judge(controller: Controller, ticks: Ticks) -> list[Drift]:
     """Return the drifts in a log: beside the command, and beside each sensor that the model has it follow at rest."""
-    command, name = controller.command, controller.signals[0]
-    reading, found, agrees = ticks.measured[:, 0], list[Drift](), False
-    largest = float(np.nanmax(np.abs(reading)))
+    reading = ticks.measured[:, 0]
+    tolerated = TOLERATED * float(np.nanmax(np.abs(reading)))
+    found, agrees = list[tuple[str, Change]](), False
     for beside, expected in _follow(controller, ticks):
-        slope, reach, lasts_s = _fit_slope(ticks, reading - expected)
-        drifts = abs(slope) - reach > TOLERATED * largest
-        if not drifts:
-            agrees = agrees or (beside != command.input and reach <= TOLERATED * largest)
-            continue
-        found.append(
-            Drift(
-                log=ticks.source, name=name, beside=beside, value=slope, low=slope - reach, high=slope + reach,
-                unit=command.reference_unit, lasts_s=lasts_s, of_reading=not (beside == command.input and agrees),
-            )
-        )  # fmt: skip
-    return found
+        friction = find_friction(controller) if beside == controller.command.input else 0.0
+        means = _average(ticks, reading - expected)
+        groups = means.sets if friction else means.levels
+        line, jump = _fit_slope(means, groups), _find_jump(means, groups)
+        sure = [each for each, most in ((line, 0.0), (jump, HELD * friction)) if each.least > tolerated + most]
+        if sure:
+            found.append((beside, max(sure, key=lambda each: each.least)))
+        if not sure and means.levels.shape[1] == 1:  # between groups a jump is not told
+            whole = _find_jump(means, means.levels)
+            agrees = agrees or max(whole.least, whole.reach) <= tolerated
+    return [
+        Drift(
+            log=ticks.source, name=controller.signals[0], beside=beside, value=each.value,
+            low=each.value - each.reach, high=each.value + each.reach, unit=controller.command.reference_unit,
+            lasts_s=each.rows / ticks.rate_hz, of_reading=not agrees,
+        )
+        for beside, each in found
+    ]  # fmt: skip
 
 
 def _follow(controller: Controller, ticks: Ticks) -> Iterator[tuple[str, Float[np.ndarray, " n"]]]:
@@ -87,21 +133,57 @@ def _follow(controller: Controller, ticks: Ticks) -> Iterator[tuple[str, Float[n
         yield controller.command.input, static[0][0].real / controller.per_effort * ticks.command
 
 
-def _fit_slope(ticks: Ticks, off: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
-    """Return by how much a column drifts over the periods of a log, how sure that is, and how long they last."""
-    from scipy.special import stdtrit  # deferred: 0.1 s
+def _average(ticks: Ticks, off: Float[np.ndarray, " n"]) -> Means:
+    """Return the means of a column over the periods of a log that have all numbers, and their noise."""
+    from scipy.special import chdtri  # deferred: 0.1 s
 
     period, starts = list_periods(ticks.reference)
-    rows = [(first, number, float(np.mean(off[first : first + period]))) for first, number in starts]
-    first, number, mean = np.array([row for row in rows if math.isfinite(row[2])] or [(0.0, 0.0, 0.0)]).T
+    there = np.isfinite(off + ticks.reference)
+    whole = [row for row in starts if np.all(there[row[0] : row[0] + period])]
+    first, number = np.array(whole, dtype=int).reshape(-1, 2).T
+    rows = off[first[:, None] + np.arange(period)]
     sets = number[:, None] == np.unique(number)
-    at, free = sets / np.sum(sets, axis=0), first.size - sets.shape[1] - 1
-    time, mean = (column - sets @ (at.T @ column) for column in (first, mean))
+    count = np.sum(sets, axis=0)
+    content = np.fft.rfft(rows, axis=1)[:, 1 : LINES + 1] / period
+    content = content - sets @ ((sets.T @ content) / count[:, None])
+    several = (sets @ count) > 1
+    power = np.mean(np.abs(content) ** 2, axis=1)[several] * (sets @ (count / np.maximum(count - 1, 1)))[several]
+    std = math.sqrt(float(np.median(power)) * 2 * LINES / float(chdtri(2 * LINES, 0.5))) if power.size else math.inf
+    level = np.mean(ticks.reference[first[:, None] + np.arange(period)], axis=1) / np.nanmax(np.abs(ticks.reference))
+    level = np.round(level / SAME_LEVEL)
+    return Means(
+        first=first, mean=np.mean(rows, axis=1), sets=sets, levels=level[:, None] == np.unique(level), period=period,
+        std=std, free=LINES * (first.size - count.size),
+    )  # fmt: skip
+
+
+def _fit_slope(means: Means, groups: Bool[np.ndarray, "p g"]) -> Change:
+    """Return by how much the means change over a log if evenly, by a line with an offset of each group."""
+    from scipy.special import stdtrit  # deferred: 0.1 s
+
+    free = means.first.size - groups.shape[1] - 1
+    if free < 1:
+        return UNKNOWN
+    at = groups / np.sum(groups, axis=0)
+    time, mean = (column - groups @ (at.T @ column) for column in (means.first, means.mean))
     spread = float(time @ time)
-    if free < 1 or not spread:
-        return 0.0, math.inf, 0.0
     slope = float(time @ mean) / spread
     left = float(np.sum((mean - slope * time) ** 2))
-    rows_of = float(np.ptp(first)) + period
+    rows = int(np.ptp(means.first)) + means.period
     reach = float(stdtrit(free, 1.0 - 0.5 * RISK)) * math.sqrt(left / free / spread)
-    return slope * rows_of, reach * rows_of, rows_of / ticks.rate_hz
+    return Change(value=slope * rows, reach=reach * rows, rows=rows)
+
+
+def _find_jump(means: Means, groups: Bool[np.ndarray, "p g"]) -> Change:
+    """Return the largest difference between two means of a group."""
+    from scipy.special import stdtrit  # deferred: 0.1 s
+
+    pair = np.triu(groups @ groups.T, 1)  # the earlier one first
+    pairs = int(np.sum(pair))
+    if not pairs or not means.free:
+        return UNKNOWN
+    apart = np.where(pair, means.mean[None, :] - means.mean[:, None], 0.0)
+    one, other = np.unravel_index(np.argmax(np.abs(apart)), apart.shape)
+    reach = float(stdtrit(means.free, 1.0 - 0.5 * RISK / pairs)) * math.sqrt(2.0) * means.std
+    rows = int(means.first[other] - means.first[one]) + means.period
+    return Change(value=float(apart[one, other]), reach=reach, rows=rows)
