@@ -174,7 +174,7 @@ def find_noise(controller: Controller, options: Mapping[str, Any]) -> float:
     given: dict[str, Any] = {key: options[key] for key in ("limits", "seed")}
     silent = design_excitation(controller, share=SILENT, bias=0.0, phases=1, periods=PERIODS, **given)
     runs = replace(controller, outer=None)
-    return _find_peaks(controller, runs, silent, (), options["sensors"])[controller.command.input]
+    return _bound_next(_find_peaks(controller, runs, silent, (), options["sensors"])[controller.command.input])
 
 
 def split_limits(
@@ -250,7 +250,7 @@ def _excite(
         excitation = design_excitation(controller, share=share, **given)
         return excitation, _measure_swing(controller, runs, _scale(excitation, per_given)) if dry else None
 
-    def find_peaks(excitation: Excitation) -> dict[str, float]:
+    def find_peaks(excitation: Excitation) -> dict[str, np.ndarray]:
         return _find_peaks(controller, runs, _scale(excitation, per_given), draws, options["sensors"])
 
     @cache  # runs of all draws, mostly asked for twice at the share that is played
@@ -277,7 +277,7 @@ def _excite(
     chosen = share
     peaks = find_peaks(excitation)
     for _ in range(LOWERS):  # a period in which the command is at its limit is lost for the response
-        if limit is None or peaks[command] < ROOM * limit:
+        if limit is None or np.max(peaks[command]) < ROOM * limit:
             break
         share *= LESS
         excitation, effort = play(share)
@@ -287,7 +287,7 @@ def _excite(
         fields["prediction"] = predict(share)
         if enough is not None and list_broken(controller, fields["prediction"]):
             fields |= {"enough": enough, "lowered": share < chosen}
-    return replace(excitation, peaks=peaks), fields
+    return replace(excitation, peaks={name: _bound_next(runs) for name, runs in peaks.items()}), fields
 
 
 def _scale(excitation: Excitation, per_given: float) -> Excitation:
@@ -309,9 +309,9 @@ def _find_peaks(
     given: Excitation,
     draws: Sequence[Mapping[str, float]],
     sensors: Sensors | None,
-) -> dict[str, float]:
-    """Return how large the command, the plant's outputs and what is read become at most under a reference: by its lines
-    where the machine is known, linear and read without error, else by runs of the design plant and of draws, each with
+) -> dict[str, np.ndarray]:
+    """Return the peaks of the command, the plant's outputs and what is read under a reference, one for each run: by its
+    lines where the machine is known, linear and read without error, else of the design plant and of draws, each with
     its own noise. With dry friction the lines tell nothing: they are those of a machine without it. A reading's noise
     is drawn anew for its own peak, which does not change how likely it is: white noise reaches the plant a sample later
     at the earliest.
@@ -323,7 +323,7 @@ def _find_peaks(
     noisy = any((*noise.noise_std.values(), *noise.quantisation.values()))
     by_lines = controller.compensation is None and given.phases == 1 and not has_dry_friction(controller)
     if by_lines and not noisy and not draws:
-        return dict(given.peaks)
+        return {name: np.array([peak]) for name, peak in given.peaks.items()}
     sets = [values, *(place_values(plant, values, draw) for draw in draws[:DRAWN])]
     if noisy:
         sets = [*sets, *sets * NOISE_RUNS][: max(len(sets), NOISE_RUNS)]
@@ -342,7 +342,7 @@ def _find_peaks(
             signals[name] = np.abs(signals[name] + std * rng.normal(size=signals[name].shape)) + 0.5 * step
         for name, rows in peaks.items():
             rows += np.max(np.abs(signals[name]), axis=1).tolist()
-    return {name: _bound_next(np.array(rows)) for name, rows in peaks.items()}
+    return {name: np.array(rows) for name, rows in peaks.items()}
 
 
 def _bound_next(peaks: Float[np.ndarray, " n"]) -> float:

@@ -179,7 +179,7 @@ def test_a_unit_of_another_kind_in_a_header_is_refused(records, tmp_path):
     text += 'inputs = { F = "F [N]" }\noutputs = { x = "x [m]" }\n'
     text += 'parameters = { m = { column = "payload", from = "header", unit = "mA" } }\n'
     (tmp_path / "cart.toml").write_text(text)
-    with pytest.raises(ProblemError, match="is in kg, and column"):
+    with pytest.raises(EstimationError, match=r"cart.toml: experiment light: parameters: m is in kg, and column"):
         so.read_problem(tmp_path / "cart.toml").experiments()
 
 

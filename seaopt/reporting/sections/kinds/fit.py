@@ -262,7 +262,10 @@ def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[Step]
             added.update(dict.fromkeys(trials[name].parts))
             table, rows = PARAMETERS, spell_parameters(trials[name].frees, trials[name].fixed)
         else:
-            table, *rows = spell_cure(name, value, _list_kept(fit, name)) or [PARAMETERS]
+            declared = next(
+                (each.plant.parameters[name] for each in fit.experiments if name in each.plant.parameters), None
+            )
+            table, *rows = spell_cure(name, value, _list_kept(declared, fit.parameters.get(name))) or [PARAMETERS]
         places.setdefault(table, {}).update(dict.fromkeys(rows))
     if not plants:
         recipes = [experiment.plant.recipe for experiment in fit.experiments[:1]]
@@ -281,10 +284,8 @@ def _write_under(table: str, rows: Iterable[str]) -> Step:
     return Step(text=f"write under {table}, in place of a line of that name if there is one:", copied=tuple(rows))
 
 
-def _list_kept(fit: Fit, name: str) -> dict[str, float]:
+def _list_kept(declared: object, stated: Parameter | None) -> dict[str, float]:
     """Return what a parameter's new line would lose: bounds that are closer than those of its plant, and a prior."""
-    plants = (experiment.plant.parameters for experiment in fit.experiments)
-    declared, stated = next((each[name] for each in plants if name in each), None), fit.parameters.get(name)
     if not isinstance(declared, Parameter) or stated is None:
         return {}
     closer = {"min": stated.min > declared.min, "max": stated.max < declared.max}
