@@ -35,7 +35,9 @@ __attribute__((visibility("default"))) int slow(const job *jobs, long count) {
 # Loops run on and on; every interrupt must come out as KeyboardInterrupt, and leave the process fit for the next run.
 LOOPS = """
 import os
+import signal
 import time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's background job begins with it ignored
 os.sched_getaffinity = lambda process: {0, 1}  # two threads on any machine
 import numpy as np
 import seaopt as so
