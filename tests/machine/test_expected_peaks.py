@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.files import to_json
+from seaopt.machine import BringUp
+from seaopt.machine.bringup import expected
+from seaopt.machine.bringup.expected import Expected, expect
 from tests.machine.conftest import KNEE
 from tests.machine.simulator import Bench, Machine
 
@@ -73,3 +78,44 @@ def test_the_largest_of_current_and_torque_stay_below_what_is_expected_at_most(p
             most = stage.excitation.peaks[signal]
             assert np.mean(peaks <= most) >= 0.97, (stage.name, signal, most, np.sort(peaks)[-4:])
             assert most <= 1.3 * np.median(peaks), (stage.name, signal, most, np.median(peaks))
+
+
+def test_draws_on_which_the_loop_runs_away_are_in_no_peak_and_no_band_and_are_said():
+    """With a tenth of the inertia the law's own simulation grows without end: its peak would be 1e33, or none."""
+    plant, values = so.plants.high_impedance(), so.plants.thor()
+    law = so.tune(plant, values, so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6))
+    light = {"J": 2e-7}
+    assert not law.close(plant, values.update(**light)).figures().stable
+    options = {"share": 0.5, "most": 0.5, "bias": 0.0, "limits": {"F1": 600.0}, "seed": 1, "sensors": None}
+    near = [{"k": 6.2e5}, {"k": 6.8e5}]
+    alone, beside = (Expected(**expect(law, draws, options, 200)) for draws in (near, [near[0], light, near[1]]))
+    assert (alone.ran_away, beside.ran_away) == (0, 1)
+    assert beside.excitation.peaks == alone.excitation.peaks and beside.stop == alone.stop
+    assert beside.step == alone.step and beside.sensitivity == alone.sensitivity
+    assert all(np.isfinite(peak) for peak in beside.excitation.peaks.values())
+
+
+def test_a_stage_whose_runs_are_not_finite_is_refused_by_its_name(monkeypatch):
+    plant, values = so.plants.high_impedance(), so.plants.thor()
+    law = so.tune(plant, values, so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, current_limit_A=9.0))
+    certificate = so.certify(law, {"machine": plant}, values, samples=5, simulations=False)
+    run_design = expected.run_design
+
+    def overflow(*arguments, **options):
+        run = run_design(*arguments, **options)
+        return replace(run, current=np.full_like(run.current, np.nan))
+
+    monkeypatch.setattr(expected, "run_design", overflow)
+    with pytest.raises(so.SeaoptError, match=r"^full: I under its reference is not finite: the loop runs away"):
+        so.bring_up(
+            law, {"machine": plant}, values, ranges={"k": (6e5, 7e5)}, samples=5, fractions=(), limits={"F1": 900.0},
+            certificate=certificate,
+        )  # fmt: skip
+
+
+def test_a_stage_says_that_draws_run_away_and_when_it_is_read_back(planned):
+    plan = planned[0]
+    lost = replace(plan, stages=tuple(replace(stage, ran_away=2) for stage in plan.stages))
+    again = BringUp.from_dict(json.loads(to_json(lost.to_dict())), {stage.name: stage.source for stage in plan.stages})
+    assert [stage.ran_away for stage in again.stages] == [2] * len(plan.stages)
+    assert "RUNS AWAY on 2 draws" in " ".join(repr(again).split()) and "RUNS AWAY" not in repr(plan)

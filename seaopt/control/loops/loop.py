@@ -178,6 +178,10 @@ class Loop:
         """Return the closed loop's eigenvalues."""
         return self.system().poles
 
+    def grows(self) -> bool:
+        """Tell whether the closed loop grows without end, from its eigenvalues; one that is at its limit does not."""
+        return float(np.max(np.abs(self.eigenvalues()), initial=0.0)) > GROWING
+
     def is_stable(self) -> bool:
         """Tell whether all of them are inside the unit circle."""
         return bool(np.max(np.abs(self.eigenvalues()), initial=0.0) < STABLE)

@@ -18,6 +18,7 @@ from seaopt.control.loops.moved_link import MOVED, find_position
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.scheduling.scheduled_controller import place_variable
 from seaopt.errors import ControlError, suggestion
+from seaopt.formatting import join_words
 from seaopt.machine.bringup.excitation import Excitation, design_excitation
 from seaopt.machine.bringup.predicted import DRAWN, find_share, list_broken, predict_played
 from seaopt.machine.design_run import run_design
@@ -83,6 +84,8 @@ class Expected(AgainstFriction):
         they keep it; None where none does.
     lowered : bool
         Whether that share is not played for the peak of the command, which is at its limit there.
+    ran_away : int
+        Draws of the certified machines whose loop grows without end: they are in no band and no peak.
     """
 
     controller: Controller
@@ -97,6 +100,7 @@ class Expected(AgainstFriction):
     prediction: Prediction | None = None
     enough: float | None = None
     lowered: bool = False
+    ran_away: int = 0
 
     @property
     def broken(self) -> tuple[str, ...]:
@@ -149,10 +153,12 @@ def expect(
     """
     shown = controller if shown is None else shown
     runs = replace(controller, outer=None) if runs is None else runs  # a stage is of the force law alone
-    excitation, fields = _excite(controller, runs, per_given, draws, options)
     assert controller.design is not None
     plant, values = controller.design
-    loops = [shown.close(plant, each) for each in (values, *(place_values(plant, values, each) for each in draws))]
+    closed = [(each, shown.close(plant, place_values(plant, values, each))) for each in draws]
+    kept = [(each, loop) for each, loop in closed if not loop.grows()]
+    excitation, fields = _excite(controller, runs, per_given, (draws, [each for each, _ in kept]), options)
+    loops = [shown.close(plant, values), *(loop for _, loop in kept)]
     f, size = excitation.frequency_hz, abs(per_given)
     stepped = [loop.simulate(np.full(count or excitation.period, per_given)) for loop in loops]
     steps, efforts = (np.array([run[k] for run in stepped]) for k in (0, 1))
@@ -165,6 +171,7 @@ def expect(
         "step": _band(controller.sample_time_s * np.arange(steps.shape[1]), steps),
         "step_size": None if limit is None else float(limit / controller.per_effort / np.max(np.abs(efforts))),
         "stop": {key: min(STOP * peak, excitation.limits.get(key, np.inf)) for key, peak in excitation.peaks.items()},
+        "ran_away": len(closed) - len(kept),
         **fields,
     }
 
@@ -234,12 +241,13 @@ def _excite(
     controller: Controller,
     runs: Controller,
     per_given: float,
-    draws: Sequence[Mapping[str, float]],
+    draws: tuple[Sequence[Mapping[str, float]], Sequence[Mapping[str, float]]],
     options: Mapping[str, Any],
 ) -> tuple[Excitation, dict[str, Any]]:
     """Return the reference of a stage; of a plant with dry friction the effort that it makes, the friction, and what
     certified machines do under it, with an amplitude that moves the motor, and at which they keep the limits of the
-    law, where the largest share of the limits, "most", allows it.
+    law, where the largest share of the limits, "most", allows it. `draws`: all, and those whose loop does not grow, of
+    which the peaks are. Raises ControlError: a run is not finite.
     """
     dry = has_dry_friction(controller)
     given: dict[str, Any] = {key: options[key] for key in ("bias", "limits", "seed")}
@@ -251,12 +259,12 @@ def _excite(
         return excitation, _measure_swing(controller, runs, _scale(excitation, per_given)) if dry else None
 
     def find_peaks(excitation: Excitation) -> dict[str, np.ndarray]:
-        return _find_peaks(controller, runs, _scale(excitation, per_given), draws, options["sensors"])
+        return _find_peaks(controller, runs, _scale(excitation, per_given), draws[1], options["sensors"])
 
     @cache  # runs of all draws, mostly asked for twice at the share that is played
     def predict(share: float) -> Prediction:
         excitation = design_excitation(controller, share=share, **given)
-        return predict_played(controller, excitation, draws, options["sensors"])
+        return predict_played(controller, excitation, draws[0], options["sensors"])
 
     def keeps(share: float) -> bool:
         return not list_broken(controller, predict(share))
@@ -282,6 +290,11 @@ def _excite(
         share *= LESS
         excitation, effort = play(share)
         peaks = find_peaks(excitation)
+    if endless := [name for name, seen in peaks.items() if not np.all(np.isfinite(seen))]:
+        raise ControlError(
+            f"{options.get('name', 'the law')}: {join_words(endless)} under its reference is not finite: the loop runs "
+            "away; tune and certify a law that keeps its limits, or narrow the ranges of what it is certified for"
+        )
     fields: dict[str, Any] = {"effort": effort, "friction": friction if dry else None}
     if predicts:
         fields["prediction"] = predict(share)

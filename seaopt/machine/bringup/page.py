@@ -62,6 +62,10 @@ LOWERED = (
     "At a share of {} they keep all, but the limit of the command stands in the way: its peak comes to it there, "
     "and such periods are lost. Raise that limit."
 )
+RAN_AWAY = (
+    "THE LOOP RUNS AWAY on {} of the machines that this law is to run on: they are not among what is expected here, so "
+    "that a machine may do more. Tune and certify it for them first."
+)
 UNTOLD = "{} cannot be confirmed in {}: see there."
 HELD = "No motion is expected in {}: dry friction holds the motor there."
 NEXT = "Go on to the next stage when the log of this one is accepted: seaopt accept PROBLEM LOG --stage NAME."
@@ -229,6 +233,7 @@ def _describe_stage(stage: Stage) -> Section:
         f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)}{ring}.",
         f"Expect: a step of the reference{_say_size(stage)} peaks at {_say_top(stage)} of its size "
         f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
+        *_say_ran_away(stage),
         *_say_whether_it_moves(stage),
         *say_prediction(stage),
         *_explain_friction(controller),
@@ -252,6 +257,7 @@ def _describe_outer(stage: Stage, around: OuterExpected) -> Section:
         f"Expect: {around.follows} after a step of the reference{_say_size(around)} peaks at {_say_top(around)} of its "
         f"size ({stage.name}/expected_outer_step.csv); the response over frequency is in "
         f"{stage.name}/expected_outer_tracking.csv.",
+        *_say_ran_away(around),
         *_say_whether_it_moves(around),
         *_explain_friction(controller),
     )
@@ -268,6 +274,11 @@ def _say_played(expected: Expected) -> str:
         f"it fades in over {lasts}, then {sets} of phases of {excitation.periods} periods of {lasts}, {f.size} lines "
         f"from {format_number(f[0], 3)} to {format_number(f[-1], 3)} Hz, then it fades out."
     )
+
+
+def _say_ran_away(expected: Expected) -> list[str]:
+    """Return that draws are not among what is expected, where their loop grows without end."""
+    return [RAN_AWAY.format(format_count(expected.ran_away, "draw"))] if expected.ran_away else []
 
 
 def _say_top(expected: Expected) -> str:

@@ -124,6 +124,7 @@ class _Played:
     stop: Mapping[str, float]
     step_size: float | None
     expected: _Bands
+    ran_away: int
 
 
 @record
@@ -133,6 +134,7 @@ class StoredStage(_Played):
     json_keys = (
         *("name", "note", "met", "law", "place", "bandwidth_hz", "command_limit", "channels", "rate_hz"),
         *("reference", "friction", "under_reference", "peaks", "limits", "stop", "step_size", "expected"),
+        "ran_away",
         *("outer", "outer_unstable", "requirements"),
     )
 
@@ -251,6 +253,7 @@ def _describe_played(expected: Expected) -> dict[str, Any]:
         "limits": excitation.limits,
         "stop": expected.stop,
         "step_size": expected.step_size,
+        "ran_away": expected.ran_away,
         "expected": _Bands(tracking=expected.tracking, sensitivity=expected.sensitivity, step=expected.step),
     }
 
@@ -313,4 +316,5 @@ def _make_played(stored: _Played, sample_time_s: float) -> dict[str, Any]:
         "prediction": prediction,
         "enough": None if under is None else under.enough_share,
         "lowered": under is not None and under.lowered,
+        "ran_away": stored.ran_away,
     }

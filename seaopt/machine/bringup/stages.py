@@ -175,6 +175,7 @@ def bring_up(
 
     for number, fraction in enumerate(sorted(fractions), start=1):
         part = options | {"share": share * fraction, "most": share, "place": controller.points[0]}
+        part["name"] = f"stage_{number}"
         law, judged, note = _find_stage(controller, fraction, tuning, certifying, tell, part)
         expected = _expect_stage(law, draws, part)
         if stages and is_same_experiment(stages[-1], expected):
@@ -190,7 +191,7 @@ def bring_up(
         certificate = certifying(controller)
     for number, place in enumerate(controller.points, start=1):
         name = FULL if len(controller.points) == 1 else f"{FULL}_{number}"
-        part = options | {"most": share, "place": place}
+        part = options | {"most": share, "place": place, "name": name}
         stage = _make_stage(name, controller, certificate, "", _expect_stage(controller, draws, part), part)
         outer = stage.controller.outer
         at = None if controller.over is None or place is None else (controller.over, place)
@@ -198,7 +199,7 @@ def bring_up(
         if outer is not None and link is not None and enclosed is None:
             stage = replace(stage, outer_unstable=True)
         if outer is not None and enclosed is not None:
-            part = options | {"most": share, "bias": 0.0, "limits": of_link}
+            part = options | {"most": share, "bias": 0.0, "limits": of_link, "name": f"{name} with its outer loop"}
             stage = replace(stage, around=expect_outer(stage.controller, outer, enclosed, draw(enclosed), part))
         keep(stage)
     return BringUp(stages=tuple(stages))
