@@ -119,7 +119,7 @@ def accept_logs(
         errors.wrap(f"note: to fit these logs too, put the tables of {written[-1]} into the problem file")
     files = [folder / FILE, folder / PAGE, *written]
     again = session.spell("certify" if stage is None else "bringup")
-    commands = Commands(fit=session.spell("fit"), certify=again)
+    commands = Commands(fit=session.spell("fit"), tune=session.spell("tune"), certify=again)
     return _show(result, content, files, json=json, amount=amount, commands=commands)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from functools import partial
 
@@ -370,6 +371,31 @@ def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
     content = json.loads((folder / "out" / "acceptance.json").read_text())
     assert [row["met"] for row in content["replay"]["logs"]] == [True, False]
     assert content["replay"]["logs"][1]["causes"][0]["kind"] == "factor"
+
+
+@pytest.mark.parametrize(
+    ("machine", "says"),
+    [
+        (Machine(delay_s=1e-3), r"next: look for [\d.]+ ms in the firmware.*: drive_delay_s = ([\d.]+) seaopt tune"),
+        (
+            Machine(mass=1.5 * Machine().mass),
+            r"next: if the machine is so, let J be free, put .*: seaopt fit .* seaopt t",
+        ),
+    ],
+)
+def test_what_differs_has_its_remedy_next(folder, accept, compiler, machine, says):
+    content = json.loads((folder / "out" / "controller.json").read_text())
+    problem = so.read_problem(folder / "stand.toml")
+    controller = so.Controller.from_dict(content, problem.design_plant, problem.values(problem.parameters))
+    bench, reference = Bench(compiler, folder, controller), multisine(1000, LINES, 8, 60.0, 3, bias=300.0)
+    done = accept(so.write_log(bench.log(machine, reference, decimals=3), folder / "other.csv"))
+    told = re.search(says, " ".join(done.output.split()))
+    assert done.exit_code == 1 and told and "certify the law" not in done.output, done.output
+    if machine.delay_s:
+        assert float(told[1]) == pytest.approx(machine.delay_s, rel=0.05)
+        line = f"drive_delay_s = {told[1]}"
+        (folder / "later.toml").write_text(PROBLEM.replace("bandwidth_hz = 30,", f"bandwidth_hz = 30, {line},"))
+        assert so.read_problem(folder / "later.toml").spec.drive_delay_s == float(told[1])
 
 
 @pytest.mark.parametrize("certificate", ["missing", "failed", "of another law"])

@@ -43,6 +43,14 @@ LARGER = (
     "a larger amplitude, beside which dry friction is less (it is another one than in the model, which more periods do "
     "not change; or fit again with this log, and tune)"
 )
+LATER = (
+    "look for {} ms in the firmware: a tick too many, a filter; if they stay, write under [controller], in place of a "
+    "line of that name, and tune again:"
+)
+ANOTHER = (
+    "if the machine is so, {}put the tables of again/experiments.toml into the problem file, fit these logs too, and "
+    "tune again:"
+)
 NO_MODEL = "the machine was compared with no model, since the law was designed on none"
 UNCERTIFIED = {
     "missing": "not certified: there is no certificate of this law",
@@ -94,11 +102,32 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
         reasons.append(Reason(what=UNCERTIFIED[result.certificate], where=", ".join(result.broken)))
     if response is None and result.replayed:
         reasons += [Reason(what=f"no response: {text}") for text in list_left_out(result)]
-    missing = result.certificate == "missing" and commands.certify
-    steps = (Step(text="certify the law:", copied=(commands.certify,)),) if missing else ()
+    steps = _list_remedies(result, commands)
+    if result.certificate == "missing" and commands.certify:
+        steps.append(Step(text="certify the law:", copied=(commands.certify,)))
     text = f"{name_acceptance(result)}: {'; '.join(parts)}"
-    verdict = Verdict(met=result.met, text=text, reasons=tuple(reasons), next=steps)
+    verdict = Verdict(met=result.met, text=text, reasons=tuple(reasons), next=tuple(steps))
     return doubt_design(verdict, commands.fit) if result.fit_met is False else verdict
+
+
+def _list_remedies(result: Acceptance, commands: Commands) -> list[Step]:
+    """Return what to do about the difference that explains best, where a remedy is known; it is one of two things: of
+    the firmware, or of the machine, which the law is then tuned for.
+    """
+    differences = result.differences
+    if not commands.tune or differences is None or differences.inside or differences.untold:
+        return []
+    steps = list[Step]()
+    for each in differences.found[:1]:
+        spec = result.controller.spec
+        if each.kind == "delay" and each.value > 0.0 and spec.delay_samples is None:
+            late = result.controller.drive_delay_s + each.value
+            lines = (f"drive_delay_s = {format_number(late)}", commands.tune)
+            steps.append(Step(text=LATER.format(f"{1e3 * each.value:.3g}"), copied=lines))
+        if each.kind in ("parameter", "gain") and each.value > 0.0 and result.experiments:
+            free = f"let {each.name} be free, " if each.kind == "parameter" else ""
+            steps.append(Step(text=ANOTHER.format(free), copied=(commands.fit, commands.tune)))
+    return steps
 
 
 def name_acceptance(result: Acceptance) -> str:
