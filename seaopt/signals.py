@@ -51,6 +51,18 @@ def measure_white(values: VectorN) -> float:
     return 1.4826 * median(third) / np.sqrt(20.0) if third.size else 0.0
 
 
+def bridge(values: VectorN) -> VectorN:
+    """Return a signal with its missing samples on lines between those that are there."""
+    there = np.flatnonzero(np.isfinite(values))
+    return values if there.size in (0, values.size) else np.interp(np.arange(values.size), there, values[there])
+
+
+def weigh_points(points: VectorN, at: float) -> VectorN:
+    """Return what the values at some points weigh in that of the polynomial through them at another (Lagrange)."""
+    others = [np.delete(points, i) for i in range(points.size)]
+    return np.array([np.prod((at - rest) / (point - rest)) for point, rest in zip(points, others, strict=True)])
+
+
 @record
 class Origin:
     """Where a channel came from."""

@@ -33,9 +33,8 @@ from seaopt.estimation.problem.correlation import find_quick_size_within
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.noise_floor import NoiseFloor
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
-from seaopt.estimation.result.model_error import bridge
 from seaopt.records import record
-from seaopt.signals import median
+from seaopt.signals import bridge, median
 
 STRETCHES = (16, 64)  # how many half-overlapping pairs of them the samples make
 SHORTEST = 32  # samples of a stretch

@@ -45,9 +45,10 @@ from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.settle import measure_misfit, settle_roughly
 from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.records import record
+from seaopt.signals import weigh_points
 
 RATES = (2, 3, 4, 5, 10)  # values a row that are tried, as long as each is better than the one before
-POINTS = np.arange(-5, 7)  # rows of a polynomial, about the two that a value lies between
+POINTS = np.arange(-5.0, 7.0)  # rows of a polynomial, about the two that a value lies between
 FAST, SMOOTH = 0.35, 0.05  # of the rate, above which a command that its rows tell has so much of its changes' power
 FIRST = 4  # iterations, after which a refit has to be nearer to the logs than the fit
 NOISE, HIGH = 1.5, 3.0  # times its noise, that a residual may be at the end; and where it was seven times that
@@ -108,13 +109,9 @@ def _is_smooth(command: Signal) -> bool:
 
 def interpolate(values: Signal, count: int) -> Float[np.ndarray, " m"]:
     """Return `count` values for each, those between on polynomials through twelve."""
-    padded = np.pad(values, (-POINTS[0], POINTS[-1]), mode="edge")
+    padded = np.pad(values, (int(-POINTS[0]), int(POINTS[-1])), mode="edge")
     rows = np.stack([padded[i : i + values.size] for i in range(POINTS.size)], axis=1)
-    weights = np.zeros((POINTS.size, count))
-    for j in range(count):
-        for i, point in enumerate(POINTS):
-            others = np.delete(POINTS, i)
-            weights[i, j] = np.prod((j / count - others) / (point - others))
+    weights = np.stack([weigh_points(POINTS, j / count) for j in range(count)], axis=1)
     return (rows @ weights).ravel()
 
 

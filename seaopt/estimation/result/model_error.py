@@ -45,7 +45,7 @@ from seaopt.estimation.problem.rounding import Rounding, equate
 from seaopt.estimation.problem.shapes import ParameterMatrix, ParameterVector, Signal, Vector
 from seaopt.estimation.result.covariance import compute_bread, compute_influence, map_to_influence, take_root
 from seaopt.records import record
-from seaopt.signals import median
+from seaopt.signals import bridge, median
 
 PARTS = 8
 HALVES = 3  # by time, by amplitude, by speed
@@ -352,12 +352,6 @@ def _split(
         masks.append(mask & np.array([late, envelope > middles[0], speed > middles[1]]))
         first += int(np.count_nonzero(mask))
     return masks
-
-
-def bridge(values: Signal) -> Signal:
-    """Return a signal with its missing samples on lines between those that are there."""
-    there = np.flatnonzero(np.isfinite(values))
-    return values if there.size in (0, values.size) else np.interp(np.arange(values.size), there, values[there])
 
 
 def find_effort(experiment: Experiment) -> int:

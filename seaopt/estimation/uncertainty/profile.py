@@ -29,6 +29,7 @@ from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.formatting import html_text
 from seaopt.records import record
+from seaopt.signals import weigh_points
 from seaopt.units import unit_after
 
 CLOSE_TO_END = 2e-3  # of tau: near enough for an end of the interval to be interpolated
@@ -280,5 +281,4 @@ def _interpolate_end(taus: list[float], values: list[float], target: float) -> f
     t, v = np.array(taus)[near], np.array(values)[near]
     if np.min(np.abs(np.subtract.outer(t, t)) + np.eye(t.size)) < 1e-12:
         return float(values[int(near[0])])
-    weights = [np.prod((target - np.delete(t, i)) / (t[i] - np.delete(t, i))) for i in range(t.size)]
-    return float(np.dot(weights, v))
+    return float(weigh_points(t, target) @ v)

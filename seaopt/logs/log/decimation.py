@@ -15,7 +15,7 @@ import numpy as np
 
 from seaopt.errors import LogError
 from seaopt.logs.quality.clock import sample_rate_hz
-from seaopt.signals import Recording, VectorK, VectorM, VectorN
+from seaopt.signals import Recording, VectorK, VectorM, VectorN, bridge
 
 PASS_BAND = 0.8  # of the new Nyquist frequency
 ATTENUATION_DB = 80.0
@@ -75,11 +75,9 @@ def _filter(values: VectorN, taps: VectorM, factor: int) -> VectorK:
         return _correlate(values, taps, factor)
     if np.all(missing):
         return np.full(_correlate(np.zeros(values.size), taps, factor).size, np.nan)
-    rows = np.arange(values.size)
-    bridged = np.interp(rows, rows[~missing], values[~missing])
     weight = np.abs(taps) / np.sum(np.abs(taps))
     lost = _correlate(missing.astype(float), weight, factor) > MISSING_WEIGHT
-    return np.where(lost, np.nan, _correlate(bridged, taps, factor))
+    return np.where(lost, np.nan, _correlate(bridge(values), taps, factor))
 
 
 def _correlate(values: VectorN, taps: VectorM, factor: int) -> VectorK:

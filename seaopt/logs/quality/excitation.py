@@ -10,7 +10,7 @@ from seaopt import welch
 from seaopt.codec import Key
 from seaopt.logs.quality.spectra import Spectra
 from seaopt.records import record
-from seaopt.signals import VectorN
+from seaopt.signals import VectorN, bridge
 
 RANGE_DB = 40.0  # below the strongest band; what is weaker is not excited
 DIP_BANDS = 3  # of a third of an octave, between usable ones: the coherence may be low in them
@@ -192,7 +192,7 @@ def find_top(excitation: InputExcitation, u: VectorN, y: VectorN, period: float)
     near = excitation.peak_hz
     if near is None:
         return None
-    u, y = (_fill(values[:MOST_ROWS]) for values in (u, y))
+    u, y = (bridge(values[:MOST_ROWS]) for values in (u, y))
     f = np.fft.rfftfreq(u.size, period)
     inside = np.flatnonzero((f > near / BESIDE) & (f < near * BESIDE))
     if inside.size < SMOOTHING.size:
@@ -206,9 +206,3 @@ def find_top(excitation: InputExcitation, u: VectorN, y: VectorN, period: float)
         return None
     std = np.sqrt(np.maximum(1.0 - coherence[good], 0.0) / coherence[good])  # up to a factor
     return welch.find_top(f[inside][good], np.abs(cross[good]) / power[good], std)[0]
-
-
-def _fill(values: VectorN) -> VectorN:
-    """Return samples with straight lines across those that are missing."""
-    rows, known = np.arange(values.size), np.flatnonzero(np.isfinite(values))
-    return np.interp(rows, known, values[known])

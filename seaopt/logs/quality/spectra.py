@@ -13,7 +13,7 @@ from jaxtyping import Complex, Float
 
 from seaopt import welch
 from seaopt.records import record
-from seaopt.signals import VectorM, VectorN
+from seaopt.signals import VectorM, VectorN, bridge
 
 SHORTEST_WINDOW, LONGEST_WINDOW = 32, 1 << 15  # samples in a window
 FEWEST_WINDOWS, MOST_WINDOWS = 4, 64
@@ -78,10 +78,8 @@ def compute_spectra(channels: Mapping[str, VectorN], segments: Sequence[slice], 
 
 def _bridge(cut: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "d n"]:
     """Put straight lines across the missing samples of windows, in place."""
-    rows = np.arange(cut.shape[1])
     for row in np.flatnonzero(~np.all(np.isfinite(cut), axis=1)):
-        good = np.flatnonzero(np.isfinite(cut[row]))
-        cut[row] = np.interp(rows, good, cut[row, good])
+        cut[row] = bridge(cut[row])
     return cut
 
 
