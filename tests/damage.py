@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 
+import pytest
+
+from seaopt.errors import FileError
 from seaopt.files import seal
 
 
@@ -16,6 +19,19 @@ def damage(content, place, key, value):
     assert table[key] != value
     table[key] = value
     return seal({name: each for name, each in damaged.items() if name != "made_from"}), damaged
+
+
+def refuse(read, content, place, key, value, words, *, file):
+    """Assert that a result with another value at a place is refused in one line, by its file and by what is wrong, and
+    with the digest from before as edited. Return it as it would be written.
+    """
+    damaged, edited = damage(content, place, key, value)
+    with pytest.raises(FileError, match=words) as caught:
+        read(damaged)
+    assert str(caught.value).startswith(file) and "\n" not in str(caught.value)
+    with pytest.raises(FileError, match="edited"):
+        read(edited)
+    return damaged
 
 
 def put(content, keys, value):

@@ -12,7 +12,7 @@ from seaopt.files import read_json, seal, to_json, write_json
 from seaopt.logs import Quality, RawLog, assess_quality
 from seaopt.logs.quality.report import QUALITY_SCHEMA
 from seaopt.signals import Signal
-from tests.damage import damage
+from tests.damage import refuse
 
 N = 4000
 
@@ -85,12 +85,7 @@ def test_what_was_read_is_what_the_file_counts(content):
     ],
 )
 def test_a_damaged_quality_is_refused(content, place, key, value, words):
-    damaged, edited = damage(content, place, key, value)
-    with pytest.raises(FileError, match=words) as caught:
-        Quality.from_dict(damaged)
-    assert str(caught.value).startswith("quality.json") and "\n" not in str(caught.value)
-    with pytest.raises(FileError, match="edited"):
-        Quality.from_dict(edited)
+    refuse(Quality.from_dict, content, place, key, value, words, file="quality.json")
 
 
 @pytest.mark.parametrize("key", ["clock", "channels", "findings", "excitation"])

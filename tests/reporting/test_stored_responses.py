@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from seaopt.files import read_json, seal, to_json, write_json
 from seaopt.progress import ignore
 from seaopt.reporting.responses import FRF_SCHEMA, Responses, estimate_responses
 from seaopt.reporting.sections import write_text
-from tests.damage import damage
+from tests.damage import damage, refuse
 
 PROBLEM = """
 schema = 1
@@ -94,12 +95,9 @@ def test_figures_of_another_machine_are_read_back(problem, content):
 )
 def test_damaged_responses_are_refused(problem, content, place, key, value, words):
     inside = () if key == "experiments" else ("experiments", "chirp")
-    damaged, edited = damage(content, (*inside, *place), key, value)
-    with pytest.raises(FileError, match=words) as caught:
-        Responses.from_dict(damaged, problem)
-    assert str(caught.value).startswith("frf.json") and "\n" not in str(caught.value)
-    with pytest.raises(FileError, match="edited"):
-        Responses.from_dict(edited, problem)
+    refuse(
+        partial(Responses.from_dict, problem=problem), content, (*inside, *place), key, value, words, file="frf.json"
+    )
 
 
 def test_responses_of_another_problem_or_version_are_refused(problem, content, tmp_path):
