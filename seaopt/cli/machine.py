@@ -157,8 +157,7 @@ def _find_played(folder: Path, stage: str | None, path: Path) -> Played | None:
 
 def _count_seconds(reference: StoredReference, outer: Played | None = None) -> Played:
     """Return how long a planned reference is."""
-    periods = reference.periods * reference.phases + 2  # one that fades in, and one that fades out
-    return Played(period_s=reference.period_s, lasts_s=periods * reference.period_s, outer=outer)
+    return Played(period_s=reference.period_s, lasts_s=reference.lasts_s, outer=outer)
 
 
 def _list_planned(folder: Path, path: Path) -> tuple[StoredStage, ...] | list[StoredStage]:
@@ -199,29 +198,24 @@ def read_besides(session: Session, alone: bool) -> dict[str, Any]:
     """
     folder, problem = session.folder, session.problem
 
-    def read_responses() -> Responses | None:
-        fit = session.read_besides("fit", Fit.from_dict)
-        return session.read_besides("frf", partial(Responses.from_dict, problem=problem, fit=fit))
+    def read_responses(content: dict[str, Any]) -> Responses:
+        return Responses.from_dict(content, problem=problem, fit=session.read_besides("fit", Fit.from_dict))
 
+    def read_quality() -> Quality | None:
+        path = folder / QUALITY
+        return Quality.from_dict(read_json(path, QUALITY_SCHEMA)) if path.exists() else None
+
+    besides = session.read_besides
     kinds: dict[str, Callable[[], Any]] = {
-        "sweep": lambda: session.read_besides("sweep", partial(read_sweep, problem, session.parameters())),
+        "sweep": lambda: besides("sweep", partial(read_sweep, problem, session.parameters())),
     }
-    further: dict[str, tuple[Path, Callable[[], Any]]] = {
-        "frf": (folder / FILES["frf"], read_responses),
-        "inspect": (
-            folder / QUALITY,
-            lambda: Quality.from_dict(read_json(folder / QUALITY, QUALITY_SCHEMA)),
-        ),
-        "accept": (
-            folder / FILES["accept"],
-            lambda: session.read_besides("accept", partial(_read_acceptance, session), ACCEPTANCE_SCHEMA),
-        ),
-        "bringup": (
-            folder / FILES["bringup"],
-            lambda: session.read_besides("bringup", partial(_read_bring_up, session), BRINGUP_SCHEMA),
-        ),
-    }
-    kinds |= {name: read for name, (path, read) in further.items() if alone and path.exists()}
+    if alone:
+        kinds |= {
+            "frf": lambda: besides("frf", read_responses),
+            "inspect": read_quality,
+            "accept": lambda: besides("accept", partial(_read_acceptance, session), ACCEPTANCE_SCHEMA),
+            "bringup": lambda: besides("bringup", partial(_read_bring_up, session), BRINGUP_SCHEMA),
+        }
     found = dict[str, Any]()
     for name, read in kinds.items():
         try:
@@ -248,13 +242,13 @@ def _read_acceptance(session: Session, content: dict[str, Any]) -> Acceptance:
 
 def _read_bring_up(session: Session, content: dict[str, Any]) -> BringUp:
     """Return the bring-up of a folder. Raises ProblemError: a stage has another law than it had."""
-    link = _find_link(session, _find_law(session, None))
+    full = _find_law(session, None)
     laws = {stage.name: _find_law(session, stage.name) for stage in list_stages(content)}
     *_, final = laws.values()
-    if hash_source(final) != hash_source(_find_law(session, None)):
+    if hash_source(final) != hash_source(full):
         path, again = session.folder / FILES["bringup"], session.spell("bringup")
         raise ProblemError(f"{path}: is of another law than is there now; run {again} again")
-    return BringUp.from_dict(content, laws, link)
+    return BringUp.from_dict(content, laws, _find_link(session, full))
 
 
 def _find_file(folder: Path, stage: str | None) -> Path:

@@ -517,9 +517,9 @@ class Session:
     def _expected(self) -> list[tuple[bool, str]]:
         """Return what came of each expectation of the problem file."""
         expectations = list_expectations(self.problem)
-        if expectations and isinstance(self.results.get("fit"), Fit):
-            self._stages.scores  # noqa: B018 - makes them, once
         there = {"fit": None, "scores": [], "tune": None, "certify": None} | self.results
+        if expectations and isinstance(there["fit"], Fit):
+            there["scores"] = self._stages.scores
         results = Stages(self.problem, **there)  # of which nothing more is made
         return [expectation.check(results) for expectation in expectations]
 

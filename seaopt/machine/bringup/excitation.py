@@ -32,6 +32,11 @@ LONGEST_S = 4.0  # of a period, but where lines have to lie lower
 FADES = 2  # periods: one that fades in, and one that fades out
 
 
+def count_periods(phases: int, periods: int) -> int:
+    """Return how many periods so many of each set of phases are with those that fade."""
+    return phases * periods + FADES
+
+
 @record(eq=False)
 class Excitation:
     """A periodic reference, one period for each set of phases, and what it does on the design plant."""
@@ -60,7 +65,7 @@ class Excitation:
     @property
     def lasts_s(self) -> float:
         """How long all of it lasts."""
-        return (self.phases * self.periods + FADES) * self.period_s
+        return count_periods(self.phases, self.periods) * self.period_s
 
     @property
     def fade(self) -> Float[np.ndarray, " period"]:
@@ -141,10 +146,11 @@ def design_excitation(
             "larger share"
         )
     scale = min(left / max(peaks[name], 1e-300) for name, left in room.items())
+    played = scale * np.array(waves)
     return Excitation(
         sample_time_s=controller.sample_time_s,
         bias=bias,
-        amplitude=float(np.max(np.abs(played := scale * np.array(waves)))),
+        amplitude=float(np.max(np.abs(played))),
         period=period,
         phases=phases,
         waves=played,

@@ -11,7 +11,7 @@ from seaopt.codec import Constraints, Key, OrInfinite, check_agrees, from_conten
 from seaopt.control import ForceMPC
 from seaopt.errors import FileError
 from seaopt.machine.acceptance import StageName, hash_source
-from seaopt.machine.bringup.excitation import Excitation
+from seaopt.machine.bringup.excitation import Excitation, count_periods
 from seaopt.machine.bringup.expected import Band, Expected, OuterExpected, enclose_link
 from seaopt.machine.response.judged import Prediction
 from seaopt.machine.response.verdicts import Motion, list_limits
@@ -88,6 +88,11 @@ class StoredReference:
     phases: Annotated[int, Constraints(ge=1)]
     frequency_hz: Annotated[tuple[float, ...], Constraints(min_length=1)]
 
+    @property
+    def lasts_s(self) -> float:
+        """How long all of it lasts."""
+        return count_periods(self.phases, self.periods) * self.period_s
+
 
 @record
 class _UnderReference:
@@ -133,8 +138,7 @@ class StoredStage(_Played):
 
     json_keys = (
         *("name", "note", "met", "law", "place", "bandwidth_hz", "command_limit", "channels", "rate_hz"),
-        *("reference", "friction", "under_reference", "peaks", "limits", "stop", "step_size", "expected"),
-        "ran_away",
+        *("reference", "friction", "under_reference", "peaks", "limits", "stop", "step_size", "expected", "ran_away"),
         *("outer", "outer_unstable", "requirements"),
     )
 
