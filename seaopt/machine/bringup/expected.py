@@ -157,7 +157,7 @@ def expect(
     plant, values = controller.design
     closed = [(each, shown.close(plant, place_values(plant, values, each))) for each in draws]
     kept = [(each, loop) for each, loop in closed if not loop.grows()]
-    excitation, fields = _excite(controller, runs, per_given, (draws, [each for each, _ in kept]), options)
+    excitation, fields = _excite(controller, runs, per_given, draws, [each for each, _ in kept], options)
     loops = [shown.close(plant, values), *(loop for _, loop in kept)]
     f, size = excitation.frequency_hz, abs(per_given)
     stepped = [loop.simulate(np.full(count or excitation.period, per_given)) for loop in loops]
@@ -241,12 +241,13 @@ def _excite(
     controller: Controller,
     runs: Controller,
     per_given: float,
-    draws: tuple[Sequence[Mapping[str, float]], Sequence[Mapping[str, float]]],
+    draws: Sequence[Mapping[str, float]],
+    kept: Sequence[Mapping[str, float]],
     options: Mapping[str, Any],
 ) -> tuple[Excitation, dict[str, Any]]:
     """Return the reference of a stage; of a plant with dry friction the effort that it makes, the friction, and what
     certified machines do under it, with an amplitude that moves the motor, and at which they keep the limits of the
-    law, where the largest share of the limits, "most", allows it. `draws`: all, and those whose loop does not grow, of
+    law, where the largest share of the limits, "most", allows it. `kept`: the draws whose loop does not grow, of
     which the peaks are. Raises ControlError: a run is not finite.
     """
     dry = has_dry_friction(controller)
@@ -259,12 +260,12 @@ def _excite(
         return excitation, _measure_swing(controller, runs, _scale(excitation, per_given)) if dry else None
 
     def find_peaks(excitation: Excitation) -> dict[str, np.ndarray]:
-        return _find_peaks(controller, runs, _scale(excitation, per_given), draws[1], options["sensors"])
+        return _find_peaks(controller, runs, _scale(excitation, per_given), kept, options["sensors"])
 
     @cache  # runs of all draws, mostly asked for twice at the share that is played
     def predict(share: float) -> Prediction:
         excitation = design_excitation(controller, share=share, **given)
-        return predict_played(controller, excitation, draws[0], options["sensors"])
+        return predict_played(controller, excitation, draws, options["sensors"])
 
     def keeps(share: float) -> bool:
         return not list_broken(controller, predict(share))

@@ -95,16 +95,17 @@ def _judge(controller: Controller, ticks: Ticks) -> list[Drift]:
     """Return the drifts in a log: beside the command, and beside each sensor that the model has it follow at rest."""
     reading = ticks.measured[:, 0]
     tolerated = TOLERATED * float(np.nanmax(np.abs(reading)))
+    period, starts = list_periods(ticks.reference)
     found, agrees = list[tuple[str, Change]](), False
     for beside, expected in _follow(controller, ticks):
         friction = find_friction(controller) if beside == controller.command.input else 0.0
-        means = _average(ticks, reading - expected)
+        means = _average(ticks, reading - expected, period, starts)
         groups = means.sets if friction else means.levels
         line, jump = _fit_slope(means, groups), _find_jump(means, groups)
         sure = [each for each, most in ((line, 0.0), (jump, HELD * friction)) if each.least > tolerated + most]
         if sure:
             found.append((beside, max(sure, key=lambda each: each.least)))
-        if not sure and means.levels.shape[1] == 1:  # between groups a jump is not told
+        elif means.levels.shape[1] == 1:  # between groups a jump is not told
             whole = _find_jump(means, means.levels)
             agrees = agrees or max(whole.least, whole.reach) <= tolerated
     return [
@@ -133,11 +134,12 @@ def _follow(controller: Controller, ticks: Ticks) -> Iterator[tuple[str, Float[n
         yield controller.command.input, static[0][0].real / controller.per_effort * ticks.command
 
 
-def _average(ticks: Ticks, off: Float[np.ndarray, " n"]) -> Means:
-    """Return the means of a column over the periods of a log that have all numbers, and their noise."""
+def _average(ticks: Ticks, off: Float[np.ndarray, " n"], period: int, starts: Sequence[tuple[int, int]]) -> Means:
+    """Return the means of a column over the periods of a log that have all numbers, and their noise. `period`,
+    `starts`: as of `list_periods`.
+    """
     from scipy.special import chdtri  # deferred: 0.1 s
 
-    period, starts = list_periods(ticks.reference)
     there = np.isfinite(off + ticks.reference)
     whole = [row for row in starts if np.all(there[row[0] : row[0] + period])]
     first, number = np.array(whole, dtype=int).reshape(-1, 2).T

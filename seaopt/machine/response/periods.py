@@ -30,6 +30,7 @@ from seaopt.logs.quality.faults import find_runs
 from seaopt.machine.response.runaway import say_runaway
 from seaopt.machine.ticks import AT_LIMIT, Ticks
 from seaopt.records import record
+from seaopt.signals import bridge
 
 SHORTEST = 20  # ticks of a period
 LIKE = 0.25  # of the autocorrelation at zero: what a period's is at least
@@ -234,14 +235,13 @@ def _fill(
     reference: Float[np.ndarray, " n"], period: int, stretches: Sequence[tuple[int, int]]
 ) -> Float[np.ndarray, " n"]:
     """Return a reference with the rows that are missing as they are in the other periods of their stretch."""
-    filled, n = reference.copy(), np.arange(reference.size)
+    filled = reference.copy()
     for first, whole in stretches:
         part = filled[first : first + period * whole].reshape(whole, period)  # a view
         for row in part:
             for other in part:
                 np.copyto(row, other, where=np.isnan(row))
-    there = np.isfinite(filled)
-    return np.interp(n, n[there], filled[there])
+    return bridge(filled)
 
 
 def say_left_out(left_out: LeftOut) -> list[str]:

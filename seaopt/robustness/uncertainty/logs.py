@@ -20,6 +20,7 @@ amplitude; a line at which the model itself breaks the limit there is one only w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -311,11 +312,9 @@ def _bound_ms(lines: _WindowLines, limit: float) -> tuple[float, int]:
 
 def _is_turned(model: Any, error: Any, radius: Any) -> bool:
     """Tell whether 1 + L turns about zero otherwise than the model's, all discs leaving zero out."""
-    ratio = 1.0 + error / model
-    steps = np.angle(ratio[1:] / ratio[:-1])
     ends = [abs(error[k]) + radius[k] < abs(model[k]) for k in (0, -1)]
-    certain = np.all(np.abs(ratio) * np.abs(model) > radius) and np.all(np.abs(steps) < 0.5 * np.pi)
-    return bool(all(ends) and certain and abs(np.sum(steps)) > np.pi)
+    certain = np.all(np.abs(1.0 + error / model) * np.abs(model) > radius)
+    return bool(all(ends) and certain and _measure_turn(model, error) > np.pi)
 
 
 def _ask_band(controller: Controller, lines: _WindowLines) -> tuple[float, float]:
@@ -345,7 +344,12 @@ def _turns_alike(model: Any, error: Any, radius: Any) -> bool:
     """Tell whether 1 + L turns about zero as often as the model's, where no line's disc holds zero: it turns as the
     model does along the lines, begins on the model's side, and leaves the model, which stands alone above, at the end.
     """
+    ends = (1.0 + error[0] / model[0]).real > 0.0 and abs(error[-1]) + radius[-1] < abs(model[-1])
+    return bool(ends and _measure_turn(model, error) < np.pi)
+
+
+def _measure_turn(model: Any, error: Any) -> float:
+    """Return by how much 1 + L turns about zero beside the model's, in radians; NaN where lines lie too far apart."""
     ratio = 1.0 + error / model
     steps = np.angle(ratio[1:] / ratio[:-1])
-    ends = ratio[0].real > 0.0 and abs(error[-1]) + radius[-1] < abs(model[-1])
-    return bool(ends and np.all(np.abs(steps) < 0.5 * np.pi) and abs(np.sum(steps)) < np.pi)
+    return float(abs(np.sum(steps))) if np.all(np.abs(steps) < 0.5 * np.pi) else math.nan
