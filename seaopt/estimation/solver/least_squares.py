@@ -220,8 +220,9 @@ def find_blocked(model: QuadraticModel, low: Vector, high: Vector) -> Bool[np.nd
 
 def _step(model: QuadraticModel, blocked: Bool[np.ndarray, " n"], scale: Vector, radius: float) -> tuple[Vector, float]:
     """Return the step within the radius and its lambda; the linear unknowns follow the others."""
-    bound, follow = ~blocked & ~model.linear, ~blocked & model.linear
     h, g = model.hessian, model.gradient
+    free = ~blocked & (np.diag(h) > 0.0)  # what is not seen at all would go as far as rounding takes it
+    bound, follow = free & ~model.linear, free & model.linear
     matrix, gradient, response = h[bound][:, bound], g[bound], np.zeros((0, 0))
     if np.any(follow):
         right = np.column_stack([g[follow], h[follow][:, bound]])

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.estimation.problem.fit_problem import count_evaluations
+from seaopt.estimation.problem.normal_equations import QuadraticModel
 from seaopt.estimation.problem.unknowns import collect
+from seaopt.estimation.solver.least_squares import minimise
 from seaopt.progress import ignore
 
 PERIOD, N, PARTS = 1e-3, 4000, 20
@@ -29,7 +32,7 @@ def simulate_rotor(current, speed):
     return out
 
 
-def fit_start(seed, output, speed, quiet_s, friction=0.01, progress=ignore):
+def fit_start(seed, output, speed, quiet_s, friction=0.01, progress=ignore, shots=1):
     rng, t = np.random.default_rng(seed), np.arange(N) * PERIOD
     lines = (0.7, 1.9, 4.1, 7.3, 12.1, 20.0)
     current = (t > quiet_s) * sum(0.6 * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in lines)
@@ -38,7 +41,8 @@ def fit_start(seed, output, speed, quiet_s, friction=0.01, progress=ignore):
     log = so.Log.from_arrays(time=t, I=current, **{output: reading + noise * rng.normal(size=N)})
     plant = so.plants.let_stick(so.plants.rotary(link="locked"))
     start = plant.defaults.update(c_s=C_S, J_m=2e-4, k_s=200.0, f_c=friction, b_r=3e-4).free(*TRUTH)
-    return so.fit([so.Experiment(plant=plant, log=log, outputs=(output,))], start, diagnostics=False, progress=progress)
+    experiment = so.Experiment(plant=plant, log=log, outputs=(output,), shots=shots)
+    return so.fit([experiment], start, diagnostics=False, progress=progress)
 
 
 @pytest.mark.parametrize(("seed", "output"), [(0, "theta_m"), (1, "theta_m"), (2, "tau_s")])
@@ -71,6 +75,40 @@ def test_shots_within_a_stretch_start_in_motion():
     unknowns = collect((one,), plant.defaults.update(f_c=0.1).free("k_s"))[0]
     known = {name for name, std in zip(unknowns.names, unknowns.prior_std, strict=True) if np.isfinite(std)}
     assert known == {"experiment.initial.thetad_m"}
+
+
+@pytest.mark.parametrize(("shots", "seed"), [(5, 5), (10, 5), (5, 6)])
+def test_shots_that_begin_where_the_joint_is_held_leave_its_speed_alone(shots, seed):
+    """No sample shows it, and rounding took it to 1e127 rad/s in every step: such fits ended at the given values."""
+    before = count_evaluations()
+    fit = fit_start(seed, "theta_m", speed=0.0, quiet_s=0.5, friction=0.06, shots=shots)
+    assert fit.status == "converged"
+    assert count_evaluations() - before < 100
+    for name, true in TRUTH.items():
+        assert abs(fit.parameters[name].value - true) < 4.0 * fit.parameters[name].std + 2e-3 * true
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_search_leaves_alone_what_nothing_shows(seed):
+    rng = np.random.default_rng(seed)
+    matrix, nearest = rng.normal(size=(120, 40)), rng.normal(size=40)
+    matrix[:, 7] = 0.0
+
+    class Bent:
+        def evaluate(self, z):
+            residuals, slopes = matrix @ np.arctan(z - nearest), matrix / (1.0 + (z - nearest) ** 2)
+            return QuadraticModel(
+                z=z,
+                cost=0.5 * residuals @ residuals,
+                gradient=slopes.T @ residuals,
+                hessian=slopes.T @ slopes,
+                linear=np.zeros(40, bool),
+            )
+
+    infinite = np.full(40, np.inf)
+    solution = minimise(Bent(), np.ones(40), -infinite, infinite, max_iterations=100)
+    assert solution.z[7] == 1.0
+    np.testing.assert_allclose(np.delete(solution.z, 7), np.delete(nearest, 7), atol=1e-6)
 
 
 def test_one_that_is_thrown_is_found_to_be():
