@@ -308,7 +308,8 @@ class _Spectra:
             # Neighbouring lines of a Hann window share two thirds of their amplitude: two lines tell as much as one.
             n = max(0.5 * (end - start), 1.0)
             shape, scale = n * mean**2 / variance, variance / mean
-            p = exceeds(shape, n * float(total) / (end - start) / scale)
+            x = n * float(total) / (end - start) / scale
+            p = exceeds(shape, x) if x > shape else 1.0  # less than the mean is chance
             if p < best:
                 best, band = p, (float(f[start]), float(f[end - 1]))
         return min(best * starts.size * trials, 1.0), band

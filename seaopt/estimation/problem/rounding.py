@@ -132,7 +132,7 @@ class Rounding:
         white = self.noise**2 + self.step**2 / 12.0 - float(np.sum(weights))
         return self._weigh(self.sums[0], weights) + white * gram
 
-    def compare(self, part: int, inverses: Sequence[ParameterMatrix]) -> ParameterVector:
+    def compare(self, part: int, inverses: Float[np.ndarray, "parts q q"]) -> ParameterVector:
         """Return the variances by which the harmonics move what one part of the samples and the others differ by, of
         which these are the inverse informations.
         """

@@ -184,12 +184,10 @@ def _jackknife(
     information: ParameterMatrix, sums: _Sums, b2: ParameterVector, inflation: ParameterVector, *, noise_alone: bool
 ) -> ParameterMatrix:
     """Return what the estimates move by without one part of the log, beyond what noise moves them."""
-    q, root = len(information), take_root(invert(information)[0])
-    moved, by_noise = np.zeros((PARTS, q)), np.zeros((PARTS, q))
-    for k in range(PARTS):
-        without = _invert_part(information - sums.information[k], root)
-        moved[k] = -without @ sums.score[k]
-        by_noise[k] = np.diag(without @ sums.information[k] @ without) * inflation
+    root = take_root(invert(information)[0])
+    without = _invert_parts(information - sums.information, root)
+    moved = -np.einsum("kij,kj->ki", without, sums.score)
+    by_noise = np.diagonal(without @ sums.information @ without, 0, 1, 2) * inflation
     apart = moved - np.mean(moved, axis=0)
     share = (PARTS - 1.0) / PARTS
     matrix = share * apart.T @ apart
@@ -210,11 +208,11 @@ def _compare_halves(information: ParameterMatrix, sums: _Sums, inflation: Parame
     for s in range(HALVES):
         if not FEWEST < sums.share[s] < 1.0 - FEWEST:
             continue
-        halves = (sums.half_information[s], whole - sums.half_information[s])
-        inverses = [_invert_part(half + 0.5 * priors, root) for half in halves]
+        halves = np.array([sums.half_information[s], whole - sums.half_information[s]])
+        inverses = _invert_parts(halves + 0.5 * priors, root)
         scores = (sums.half_score[s] - 0.5 * whole_score, 0.5 * whole_score - sums.half_score[s])
         shift = 0.5 * (inverses[0] @ scores[0] - inverses[1] @ scores[1])
-        white = np.maximum(np.diag(inverses[0] + inverses[1]), 0.0) * inflation
+        white = np.maximum(np.diag(np.sum(inverses, axis=0)), 0.0) * inflation
         rounded = sum((each.compare(s, inverses) for each in sums.coarse), np.zeros(q))
         std = 0.5 * np.sqrt(np.maximum(white, rounded))
         apart[s] = np.where(np.abs(shift) > APART * std, shift, 0.0)
@@ -223,11 +221,11 @@ def _compare_halves(information: ParameterMatrix, sums: _Sums, inflation: Parame
     return chosen.T @ chosen
 
 
-def _invert_part(information: ParameterMatrix, root: ParameterMatrix) -> ParameterMatrix:
-    """Return the inverse of a part's information over what it shows; `root`: of the inverse of the whole's."""
+def _invert_parts(information: Float[np.ndarray, "k q q"], root: ParameterMatrix) -> Float[np.ndarray, "k q q"]:
+    """Return the inverses of parts' information over what each shows; `root`: of the inverse of the whole's."""
     values, vectors = np.linalg.eigh(root.T @ information @ root)
-    seen = values > SEEN
-    return root @ (vectors[:, seen] / values[seen]) @ vectors[:, seen].T @ root.T
+    along = root @ vectors
+    return (along / np.where(values > SEEN, values, np.inf)[:, None, :]) @ along.swapaxes(1, 2)
 
 
 def _sum_parts(
