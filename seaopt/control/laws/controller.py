@@ -273,10 +273,11 @@ class Controller(ClosesLoops, Result, Worded):
         return gains.weigh_observer(self.close(*model), self.spec.bandwidth_hz)
 
     @property
-    def observer_notes(self) -> tuple[str, ...]:
-        """What is said of an observer that does next to nothing."""
-        share = self.observer_share
-        return () if self.observer is None or share is None else self.observer.warn(share, self.spec.bandwidth_hz)
+    def part_notes(self) -> tuple[str, ...]:
+        """What is said of an observer that does next to nothing, and of what feedforward of the link costs."""
+        share, effect = self.observer_share, None if self.link is None else self.link.effect
+        notes = self.observer.warn(share, self.spec.bandwidth_hz) if self.observer and share is not None else ()
+        return notes if effect is None else (*notes, f"link feedforward: {effect.describe()}")
 
     @property
     def bandwidth_without_prefilter_hz(self) -> float | None:
@@ -351,7 +352,7 @@ class Controller(ClosesLoops, Result, Worded):
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks besides the limits, one sentence each."""
-        always = (*self.spec.lifted_notes, *map(str, self.measured), *self.observer_notes)
+        always = (*self.spec.lifted_notes, *map(str, self.measured), *self.part_notes)
         if self.design is None:
             return always
         plant, values = self.design
@@ -377,14 +378,8 @@ class Controller(ClosesLoops, Result, Worded):
         """Return what is fed forward of the link, and which noise is large because nothing was asked of it."""
         called, notes = self.command.mechanics, list[str]()
         if self.link is not None:
-            text = self.link.describe()
-            if self.achieved.other_noise_gains:
-                text += (
-                    f"; 1e-6 {self.link.unit} of noise on it makes up to "
-                    f"{1e-6 * self.achieved.other_noise_gains[-1]:.3g} {called.unit} of motor {called.word}, less with "
-                    "a lower corner_hz"
-                )
-            notes.append(text)
+            heard = self.achieved.other_noise_gains
+            notes.append(self.link.describe(heard[-1] if heard else None, called))
         T_f = self.gains.get("T_f", np.inf) if self.gains.get("k_d") else np.inf
         if self.spec.level("max_noise_gain") is None and T_f <= UNFILTERED * self.sample_time_s:
             notes.append(

@@ -200,6 +200,7 @@ class GainTable:
             damping=numbers["link_damping"] * per_fraction,
             corner_hz=float(np.arctan(numbers["link_w"])) / per_hz,
             high_pass_hz=float(np.arctan(numbers["link_slow_w"])) / per_hz if low.high_pass_hz else 0.0,
+            effect=None,
         )
 
     def law(self, value: float) -> Law:

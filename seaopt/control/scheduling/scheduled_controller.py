@@ -184,7 +184,7 @@ class ScheduledController(Result, Worded):
         shared = [note for note in self.controllers[0].notes if all(note in each.notes for each in self.controllers)]
         rows, notes = self.table.gains, list[str]()
         for point, each in zip(self.points, self.controllers, strict=True):
-            notes += [f"{self.over} = {point:g}: {note}" for note in each.observer_notes if note not in shared]
+            notes += [f"{self.over} = {point:g}: {note}" for note in each.part_notes if note not in shared]
         if not any(np.ptp(row) > SAME_GAIN * np.max(np.abs(row)) for row in rows.values()):
             notes.append(f"no gain changes over {self.over}: one law for all points does, without a schedule")
         for name, row in rows.items():  # a gain that more than doubles: another valley of the tuner, or too few points

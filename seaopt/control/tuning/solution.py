@@ -29,7 +29,8 @@ from seaopt.control.laws.limits import BY_NAME, MeasuredLoop
 from seaopt.control.laws.spec import LOWEST_HZ
 from seaopt.control.laws.verdict import judge_all
 from seaopt.control.loops.absolute_stability import SIMPLEST
-from seaopt.control.loops.compensation.link_feedforward import LinkPath
+from seaopt.control.loops.compensation.link_feedforward import FollowedBand, LinkEffect, LinkPath
+from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.tuning.convex_concave import improve
 from seaopt.control.tuning.evolution import Evolution
 from seaopt.control.tuning.frequencies import make_grid, place_frequencies
@@ -389,6 +390,30 @@ def lower_fraction(task: Task, x: LawNumbers, loops: list[MeasuredLoop]) -> tupl
         if broken == {FRICTION}:
             missing.append(answer)
     return max(missing, key=lambda solution: _least_slope(solution[2])) if missing else answer
+
+
+def weigh_link(task: Task, x: LawNumbers, loops: Sequence[MeasuredLoop]) -> Task:
+    """Return the task whose link's path has what it changes beside the law without it, tuned near this one; as it is
+    where the limits are kept with it or without it alone.
+    """
+    link = task.link
+    if link is None or not link.fraction or task.list_broken(loops):
+        return task
+    without = feed_link(task, replace(link, fraction=0.0))
+    start = without.tidy(x)
+    if not without.is_stable(start):
+        return task
+    other, bare = solve_near(without.aim_multipliers(start), start)
+    if without.list_broken(bare):
+        return task
+    cost = task.rank(make_grid(task), x)[1] / without.rank(make_grid(without), other)[1] - 1.0
+    bands = [
+        FollowedBand(plant=loop.name, band_hz=loop.figures.tracking_band_hz, without_hz=beside.figures.tracking_band_hz)
+        for plant, loop, beside in zip(task.plants, loops, bare, strict=True)
+        if isinstance(plant, DigitalPlant) and np.any(plant.c[-1])
+    ]
+    effect = LinkEffect(objective=task.spec.objective, cost=cost, bands=tuple(bands))
+    return feed_link(task, replace(link, effect=effect))
 
 
 def _measure_miss(task: Task, x: LawNumbers) -> float:

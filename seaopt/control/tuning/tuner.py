@@ -58,7 +58,7 @@ from seaopt.control.tuning.frequencies import count_growing
 from seaopt.control.tuning.grid import FRICTION, PlantWithFriction, Response
 from seaopt.control.tuning.law_numbers import LawNumbers
 from seaopt.control.tuning.optimisation_problem import OBJECTIVE_HZ, Task
-from seaopt.control.tuning.solution import ROOM, feed_link
+from seaopt.control.tuning.solution import ROOM, feed_link, weigh_link
 from seaopt.errors import ControlError, InternalError, SeaoptError, require_number, require_type, suggestion
 from seaopt.estimation import Fit
 from seaopt.formatting import format_values
@@ -224,6 +224,7 @@ def _tune(
     found = find_law(task, (), alone) if found is None else found
     if outer is not None:
         found = meet_outer(found, partial(_describe, design=(plant, params)), outer, around)
+    found = replace(found, task=weigh_link(found.task, found.x, found.loops))
     controller = _describe(found, (plant, params))
     progress(f"{spec.structure}, {spec.bandwidth_hz:g} Hz", 1.0)
     return controller

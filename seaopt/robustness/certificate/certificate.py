@@ -417,7 +417,7 @@ class Certificate(Result, Worded):
     def _list_notes(self) -> Iterator[str]:
         if self.controller.structure == CUSTOM and self.constrained is None:
             yield f"a law of one's own with {describe_integrators(self.controller.law)}"
-        yield from self.controller.observer_notes
+        yield from self.controller.part_notes
         yield from self.remarks
         yield from warn_unidentified(
             self.parameters, {name for plant in self.models.values() for name in plant.parameters}

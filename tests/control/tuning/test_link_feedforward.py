@@ -12,7 +12,7 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import LinkFeedforward, runnable, sweep
 from seaopt.control.deploy.export import export
-from seaopt.control.loops.compensation.link_feedforward import model_link_path
+from seaopt.control.loops.compensation.link_feedforward import LinkPath, model_link_path
 from seaopt.control.loops.loop import Loop
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.tuner import make_task
@@ -97,6 +97,52 @@ def test_the_swing_follows_from_three_hertz(fed, changes):
         assert fed.feasible and figures.ms <= 1.6
         bare = so.tune(so.plants.high_impedance(), so.plants.thor(), SPEC, {"swing": so.plants.moving_output()})
         assert bare.close(so.plants.moving_output(), so.plants.thor()).figures().tracking_band_hz[0] > 10.0
+
+
+def weigh_by_hand(controller):
+    """Return the band of the swing, and the larger integral of abs(S) over ln f up to 30 Hz, of the swing and of the
+    stand, on which the path does nothing: k/(M s^2 + b s + k), held.
+    """
+    r, g = 2e-3 / (2 * np.pi * 3), controller.gains
+    f = np.unique(np.r_[np.geomspace(0.1, 30.0, 6000), np.geomspace(0.05, 499.0, 6000), 30.0])
+    link = controller.link or LinkPath(
+        measured="", unit="", inertia=0.0, damping=0.0, is_speed=False, fraction=0.0, corner_hz=30.0, high_pass_hz=3.0
+    )
+    tracking, s = close_by_hand(replace(controller, link=link), f, -3.31e-6 / r**2, -1.31e-4 / r**2)
+    k, M, b = 655e3, 3.31e-6 / r**2, 1.31e-4 / r**2
+    held = expm(np.array([[0.0, 1.0, 0.0], [-k / M, -b / M, 1.0 / M], [0.0, 0.0, 0.0]]) * TS)
+    q = np.exp(-2j * np.pi * f * TS)
+    p = np.array([k * np.linalg.solve(z * np.eye(2) - held[:2, :2], held[:2, 2])[0] for z in 1 / q]) * q**DELAY
+    c_y = g["k_p"] + g["k_i"] * TS / 2 * (1 + q) / (1 - q) + g["k_d"] * (1 - q) / (g["T_f"] + TS - q * g["T_f"])
+    counted = (f >= 0.1) & (f <= 30.0)
+    sizes = [np.abs(each[counted]) for each in (s, 1 / (1 + p * c_y))]
+    return find_band(f, tracking), max(np.trapezoid(size, np.log(f[counted])) for size in sizes)
+
+
+def test_what_it_costs_is_said_beside_the_law_without(fed, stand, swing, thor):
+    """Against the law tuned without it from scratch, both weighed by hand; and a file keeps what is said."""
+    (band, size), (bare_band, bare_size) = map(weigh_by_hand, (fed, so.tune(stand, thor, SPEC, {"swing": swing})))
+    effect = fed.link.effect
+    (followed,) = effect.bands
+    assert effect.cost == pytest.approx(size / bare_size - 1.0, abs=2e-3) and effect.cost > 0.1
+    assert followed.plant == "swing"
+    assert followed.band_hz == pytest.approx(band, rel=2e-3)
+    assert followed.without_hz == pytest.approx(bare_band, rel=5e-3)
+    (note,) = (note for note in fed.notes if "without it" in note)
+    assert f"is {100 * effect.cost:.2g} % larger than without it, and swing follows from 2.97 to 34.5 Hz" in note
+    assert "leave" not in note
+    again = so.Controller.from_dict(json.loads(to_json(fed.to_dict())), stand, thor)
+    assert again.link.effect == effect and note in again.notes
+
+
+def test_a_path_that_wins_no_band_is_said_to_be_left_out(stand, swing, thor):
+    """A lag of 2 Hz leaves of the path what is of no use to 30 Hz: by hand the swing follows less of the band."""
+    asked = LinkFeedforward(fraction=0.3, corner_hz=2.0, high_pass_hz=0.2)
+    law = so.tune(stand, thor, replace(SPEC, link_feedforward=asked), {"swing": swing})
+    bare = so.tune(stand, thor, SPEC, {"swing": swing})
+    assert np.divide(*weigh_by_hand(law)[0]) > np.divide(*weigh_by_hand(bare)[0])
+    assert law.met and law.link.effect.bands[0].octaves_won < 0.0
+    assert any(note.endswith("no more of the band, so leave link_feedforward out") for note in law.notes)
 
 
 def test_a_slow_reference_is_followed_sample_by_sample(fed):

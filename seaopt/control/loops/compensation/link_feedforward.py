@@ -63,6 +63,7 @@ from seaopt.plants.friction import take_sliding
 from seaopt.plants.memo import memo
 from seaopt.plants.roles import Sensing
 from seaopt.records import record
+from seaopt.units import Mechanics
 
 LOWEST_HZ = 1e-3  # limits are kept from here
 FIT_FREQUENCIES = 12
@@ -109,6 +110,47 @@ class LinkFeedforward:
 
 
 @record
+class FollowedBand:
+    """The band in which abs(F/F_ref) stays within 3 dB of 1 on a plant whose link moves; None where it does nowhere."""
+
+    plant: str
+    band_hz: tuple[float, float] | None
+    without_hz: tuple[float, float] | None  # of the law without the path
+
+    @property
+    def octaves_won(self) -> float:
+        """By how many octaves it is wider than without the path."""
+        return _count_octaves(self.band_hz) - _count_octaves(self.without_hz)
+
+
+@record
+class LinkEffect:
+    """What the path changes beside the law tuned without it, from this one on, to the same limits."""
+
+    objective: str  # what the tuner makes least: "disturbance", the integral of abs(S), or "noise", the noise gain
+    cost: float  # by which share that is larger
+    bands: tuple[FollowedBand, ...]  # of every plant whose link moves
+
+    def describe(self) -> str:
+        """Say in one line what it costs, and where references are followed on the plant that gains least of it."""
+        what = "noise gain" if self.objective == "noise" else "integral of abs(S)"
+        text = f"the {what} is {100 * abs(self.cost):.2g} % {'larger' if self.cost > 0 else 'smaller'} than without it"
+        if not self.bands:
+            return text
+        least = min(self.bands, key=lambda band: band.octaves_won)
+        text += f", and {least.plant} follows {_say(least.band_hz)}, without it {_say(least.without_hz)}"
+        return text if least.octaves_won > 0.0 else f"{text}: no more of the band, so leave link_feedforward out"
+
+
+def _count_octaves(band_hz: tuple[float, float] | None) -> float:
+    return 0.0 if band_hz is None else math.log2(band_hz[1] / max(band_hz[0], LOWEST_HZ))
+
+
+def _say(band_hz: tuple[float, float] | None) -> str:
+    return "nowhere" if band_hz is None else f"from {band_hz[0]:.3g} to {band_hz[1]:.3g} Hz"
+
+
+@record
 class LinkPath:
     """The path from the link's measured motion to the effort.
 
@@ -124,6 +166,8 @@ class LinkPath:
         Of the effort that the model says.
     corner_hz, high_pass_hz : float
         Of the low-pass and of the high-pass; a high-pass of zero is none.
+    effect : LinkEffect or None
+        What it changes; None where the law was not tuned with it, or no law near it keeps the limits without it.
     """
 
     measured: str
@@ -134,6 +178,7 @@ class LinkPath:
     fraction: float
     corner_hz: Annotated[float, Constraints(gt=0.0)]
     high_pass_hz: Annotated[float, Constraints(ge=0.0)]
+    effect: LinkEffect | None = None
 
     def feedback(self, sample_time_s: float) -> TransferFunction:
         """Return C of u = - C x, in q = 1/z."""
@@ -150,13 +195,19 @@ class LinkPath:
             num, den = np.convolve(num, delta), np.convolve(den, delta + slow * double)
         return TransferFunction(num=-self.fraction * num / den[0], den=den / den[0])
 
-    def describe(self) -> str:
-        """Say in one line what is fed forward."""
+    def describe(self, noise_gain: float | None, called: Mechanics) -> str:
+        """Say in one line what is fed forward, and what noise on it makes where that gain is known."""
         per = ("its rate", "it") if self.is_speed else ("its acceleration", "its speed")
         low = f"from {self.high_pass_hz:.3g} " if self.high_pass_hz else ""
-        return (
+        text = (
             f"link feedforward of {self.measured} [{self.unit}], {low}to {self.corner_hz:.3g} Hz: "
             f"{100 * self.fraction:.3g} % of {self.inertia:.4g} times {per[0]} and {self.damping:.4g} times {per[1]}"
+        )
+        if noise_gain is None:
+            return text
+        return (
+            f"{text}; 1e-6 {self.unit} of noise on it makes up to {1e-6 * noise_gain:.3g} {called.unit} of motor "
+            f"{called.word}, less with a lower corner_hz"
         )
 
     def see(self, plant: Plant) -> Plant:
