@@ -1,6 +1,7 @@
 """How often a certified law keeps its limits on actuators that are not the model, with and without the logs as judge.
 
-    python benchmarks/judge/run.py --fits 60 --seed 7 [--first 0] [--exact] [--json FILE] [--read FILE ...]
+    python benchmarks/judge/run.py --fits 60 --seed 7 [--first 0] [--exact [--spoil gain]] [--json FILE]
+    python benchmarks/judge/run.py --read FILE ...
 
 Actuators, effects and logs are those of benchmarks/truth, which share nothing with seaopt. Each is fitted to one log
 (--holdout: but its last part; --validate: another, of that share of the amplitude, is for validation), tuned with a
@@ -9,7 +10,8 @@ multisine on the command to the command, at two amplitudes with random phases, a
 where Ms is over its limit by more than the grace of the certificate, or the step overshoots by more than 1.1 times the
 reference peak, or does not settle. With --exact nothing is missing from any model, and a law is judged by its logs
 alone: one that is refused, and is not bad, was refused wrongly. Only laws that a log refuses or confirms are played
-there.
+there. With --spoil the log for validation is another actuator's, with half the gain or 3 ms more of delay, and what is
+counted is how many such logs a certificate names, and how many of them for the model alone, as Ms is kept.
 """
 
 from __future__ import annotations
@@ -39,7 +41,9 @@ BANDWIDTH_HZ = {"screw": 25.0, "ankle": 15.0}
 OTHERS_HZ, RESERVE = 10.0, 0.03
 DIRECT: dict[str, Any] = {"measured": ("tau_s", "thetad_m"), "structure": "cascade"}  # no pid keeps its limits
 SHARES = (0.5, 0.2)  # of the log's rms, of the multisine on the command
-PHASES, PERIOD_S, GRACE, LOG_ROW = 3, 2.0, 1.05, "log_sensitivity"
+PHASES, PERIOD_S, GRACE = 3, 2.0, 1.05
+LOG_ROWS = "log_sensitivity", "log_agreement"
+HALF, LATER_S = 0.5, 3e-3  # another actuator's gain, and its delay beyond that of the one that was fitted
 
 
 def make_case(actuator: Actuator, seed: int, options: argparse.Namespace) -> dict[str, Any]:
@@ -51,17 +55,19 @@ def make_case(actuator: Actuator, seed: int, options: argparse.Namespace) -> dic
     params = plant.defaults.update(**known | {name: known[name] * 2.0 ** rng.uniform(-1, 1) for name in free})
     delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.01, free=True)
 
-    def record(name: str, share: float, seed: int) -> so.Experiment:
-        readings = actuator.record(seconds=options.seconds, amplitude=share, seed=seed)
+    def record(of: Actuator, share: float, seed: int, gain: float = 1.0, **fields: Any) -> so.Experiment:
+        readings = of.record(seconds=options.seconds, amplitude=share, seed=seed)
+        readings["I"] = readings["I"] / gain
         log = so.Log.from_arrays(**readings).restamp(rate_hz=RATE_HZ)
         outputs = tuple(name for name in readings if name not in ("time", "I"))
-        return so.Experiment(plant=plant, log=log, outputs=outputs, delay_s=delay, name=name)
+        return so.Experiment(plant=plant, log=log, outputs=outputs, **fields)
 
-    fitted = record("log0", options.amplitude, seed)
-    others = [record("other", options.validate * options.amplitude, seed + SEEDS)] if options.validate else []
-    fit = so.fit(
-        [fitted], params.free(*free), validation=others, holdout=options.holdout, diagnostics=not options.exact
-    )
+    fitted = record(actuator, options.amplitude, seed, delay_s=delay, name="log0")
+    later = LATER_S if options.spoil == "delay" else 0.0
+    other = replace(actuator, delay_s=actuator.delay_s + later)
+    gain, share = HALF if options.spoil == "gain" else 1.0, options.validate * options.amplitude
+    others = [record(other, share, seed + SEEDS, gain, name="other")] if options.validate else []
+    fit = so.fit([fitted], params.free(*free), validation=others, holdout=options.holdout)
     row: dict[str, Any] = {"fit_met": fit.met, "status": fit.status}
     chosen = DIRECT if actuator.kind == "direct" else {"measured": "F1" if kind.linear else "tau_s"}
     rms = float(np.std(fitted.log["I"]))
@@ -76,13 +82,18 @@ def make_case(actuator: Actuator, seed: int, options: argparse.Namespace) -> dic
     if options.exact:  # what other checks say of it does not matter
         limit = spec.level("max_sensitivity")
         verdicts = [verdict for log in (fitted, *others) for verdict in judge_log(controller, fit, log, limit)[0]]
-        refused = any(verdict.outcome == "refuted" for verdict in verdicts)
-        row |= {"refused": [LOG_ROW] * refused, "certified": True}
-        played = refused or any(verdict.outcome == "confirmed" for verdict in verdicts)
+        broken = (
+            any(verdict.outcome == "refuted" for verdict in verdicts),
+            any(verdict.agreement is not None and verdict.agreement.contradicts for verdict in verdicts),
+        )
+        row |= {"refused": [name for name, is_broken in zip(LOG_ROWS, broken, strict=True) if is_broken]}
+        row |= {"certified": True} | ({} if options.spoil is None else {"spoiled": options.spoil})
+        confirmed = any(verdict.outcome == "confirmed" for verdict in verdicts)
+        played = options.spoil is None and (any(broken) or confirmed)
     else:
         certificate = so.certify(controller, {"stand": plant}, fit, samples=500, simulations=False)
         verdicts, row["refused"] = certificate.logs, [each.name for each in certificate.requirements if not each.met]
-        row["certified"], played = not {*row["refused"]} - {LOG_ROW}, True
+        row["certified"], played = not {*row["refused"]} - {*LOG_ROWS}, True
     row["logs"] = [asdict(verdict) for verdict in verdicts]
     return row | (play(actuator, controller, rms, rng) if played else {})
 
@@ -145,10 +156,14 @@ def summarise(rows: list[dict[str, Any]]) -> Iterator[str]:
     """
     done = [row for row in rows if "refused" in row]
     certified = [row for row in done if row["certified"]]
-    refuted = [row for row in certified if LOG_ROW in row["refused"]]
-    kept = [row for row in certified if LOG_ROW not in row["refused"]]
+    refuted = [row for row in certified if _is_refused(row)]
+    kept = [row for row in certified if not _is_refused(row)]
     others = [row for row in done if not row["certified"]]
     yield f"{len(rows)} cases, {len(done)} tuned; {sum(row['fit_met'] for row in done)} on fits that are met"
+    if any("spoiled" in row for row in done):
+        alone = sum(row["refused"] == [LOG_ROWS[1]] for row in done)
+        yield f"another actuator's log     named {len(refuted)} of {len(done)}; {alone} for the model alone"
+        return
     all_played = all("ms" in row for row in done)  # not so with --exact
     for name, laws in (("without the logs", certified), ("with them", kept)) if all_played else ():
         met = [row for row in laws if row["fit_met"]]
@@ -156,12 +171,16 @@ def summarise(rows: list[dict[str, Any]]) -> Iterator[str]:
     fine = sum(not row["bad"] for row in refuted)
     yield f"refused by a log alone     {len(refuted)}, of which fine {fine}: of all {_share(fine, len(certified))}"
     if others:
-        also = [row for row in others if LOG_ROW in row["refused"]]
+        also = [row for row in others if _is_refused(row)]
         yield f"refused by other checks    {_count_bad(others)}; by a log too {_count_bad(also)}"
     confirmed = [row for row in done if any(log["outcome"] == "confirmed" for log in row["logs"])]
     if confirmed:
         over = sum(row["ms"] > row["limit"] for row in confirmed)
         yield f"confirmed by a log         {len(confirmed)}, over Ms {over}: {_share(over, len(confirmed))}"
+
+
+def _is_refused(row: dict[str, Any]) -> bool:
+    return any(name in row["refused"] for name in LOG_ROWS)
 
 
 def _count_bad(rows: list[dict[str, Any]]) -> str:
@@ -183,6 +202,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=15.0, help="length of each log")
     parser.add_argument("--amplitude", type=float, default=1.0, help="of the log, of the largest")
     parser.add_argument("--validate", type=float, default=0.0, help="amplitude of a second log, of the first's")
+    parser.add_argument("--spoil", choices=("gain", "delay"), help="with --exact and --validate: of another actuator")
     parser.add_argument("--holdout", type=float, default=0.0, help="share of the log that is not fitted")
     parser.add_argument("--exact", action="store_true", help="nothing is missing from any model")
     parser.add_argument("--pendulums", action="store_true", help="links that swing, too, whose fits take long")
@@ -190,6 +210,8 @@ def main() -> None:
     parser.add_argument("--read", type=Path, nargs="*", help="print the table of kept cases, and run none")
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
+    if options.spoil and not (options.exact and options.validate):
+        parser.error("--spoil takes --exact and --validate, the log that is spoiled")
     if options.read:
         rows = [row for file in options.read for row in json.loads(file.read_text())]
         print("\n".join(summarise(rows)))

@@ -180,6 +180,14 @@ class Certificate(Result, Worded):
         return all(row.met for row in self.requirements)
 
     @property
+    def risk(self) -> float:
+        """The probability with which chance makes one of its statements wrong, at most: the sum of their shares of the
+        risk. What fitted samples say states none, and is not counted.
+        """
+        shares = {row.statement: row.risk for row in self.requirements if row.risk is not None}
+        return min(sum(shares.values()), 1.0)
+
+    @property
     def unchecked(self) -> dict[str, str]:
         """What applies, requires nothing, and could not be checked, with the reason; of a schedule at one of its places
         at least.
@@ -343,6 +351,7 @@ class Certificate(Result, Worded):
                 "schema": ROBUSTNESS_SCHEMA,
                 "met": self.met,
                 "passed": self.met,
+                "risk": self.risk,
                 "requirements": to_content(self.requirements),
                 "plants": _take_worst(written, "plants", lambda plant: plant["worst"]["severity"]),
                 "friction": _take_worst(written, "friction", _rank_friction),
@@ -372,6 +381,7 @@ class Certificate(Result, Worded):
         return {
             "met": self.met,
             "passed": self.met,
+            "risk": self.risk,
             "requirements": to_content(self.requirements),
             "plants": {
                 name: {key: getattr(figures, key) for key in _REPORTED}

@@ -4,7 +4,7 @@ the logs of the fit.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +31,8 @@ from seaopt.robustness.certificate.cases import Cases, Check, CheckContext, Evid
 from seaopt.robustness.certificate.requirement import (
     DESIGN_PLANT,
     KEPT_TO,
+    LOG_AGREEMENT,
+    LOG_SENSITIVITY,
     MIN_FRICTION_MARGIN,
     SPECTRAL_RADIUS,
     UNSTABLE_LOOP,
@@ -38,13 +40,13 @@ from seaopt.robustness.certificate.requirement import (
     Spot,
     require_at_most,
 )
-from seaopt.robustness.uncertainty.logs import GRACE, LogVerdict, judge_log
+from seaopt.robustness.uncertainty.agreement import GRACE, Agreement
+from seaopt.robustness.uncertainty.logs import CONTRADICT, LogVerdict, judge_log
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES
 
 PASSIVE = "passive_band_hz"
-LOG_SENSITIVITY = "log_sensitivity"
 WITH_TERMS = (
     "margins, worst cases and draws of every plant are of the loop with the outer loop around it, with what is "
     "compensated of its weight and, where it sticks, with friction's compensation from the speed; what is asked of the "
@@ -151,21 +153,37 @@ def judge_logs(context: CheckContext, _: Progress) -> Evidence:
         logs = [each for each in logs if np.isclose(_find_log_place(context.place[0], fit, each), context.place[1])]
     judged = [judge_log(controller, fit, experiment, limit) for experiment in logs]
     verdicts = tuple(verdict for of_log, _ in judged for verdict in of_log)
-    rows = (
-        require_at_most(
-            LOG_SENSITIVITY,
-            each.ms_least,
-            limit * (1.0 + GRACE),
-            plant=f"log:{each.experiment}",
-            text=describe_log(each),
-            risk=None if each.confidence is None else 1.0 - each.confidence,
-        )
-        for each in verdicts
-    )
+    rows = [row for each in verdicts for row in _list_log_rows(each, limit * (1.0 + GRACE))]
     remarks = [SILENT[silent.why].format(silent) for _, silent in judged if silent is not None]
     if fit.experiments and not logs and context.place is None:
         remarks.append(NO_LOG)
-    return Evidence(requirements=tuple(rows), fields={"logs": verdicts}, remarks=tuple(remarks), scope="measured")
+    return Evidence(requirements=rows, fields={"logs": verdicts}, remarks=tuple(remarks), scope="measured")
+
+
+def _list_log_rows(log: LogVerdict, limit: float) -> Iterator[Requirement]:
+    """Yield what a log says of the law, and of the model that the other checks judge it by, each with its risk."""
+    plant, independent = f"log:{log.experiment}", log.confidence is not None
+    risk = None if log.confidence is None else 1.0 - log.confidence
+    yield require_at_most(LOG_SENSITIVITY, log.ms_least, limit, plant=plant, text=describe_log(log), risk=risk)
+    if log.agreement is not None:
+        yield require_at_most(
+            LOG_AGREEMENT,
+            log.agreement.misfit,
+            log.agreement.allowed,
+            plant=plant,
+            text=f"{log.samples}, {describe_agreement(log.agreement)}",
+            risk=CONTRADICT if independent else None,
+        )
+
+
+def describe_agreement(agreement: Agreement) -> str:
+    """Return whether a log agrees with the model, and where least, for its row."""
+    if not agreement.contradicts:
+        return "agrees with the model"
+    return (
+        f"contradicts the model: its response is off by {100 * agreement.off:.2g} % at {agreement.off_hz:.3g} Hz, "
+        "which noise and the fit's intervals do not explain"
+    )
 
 
 def describe_log(log: LogVerdict) -> str:

@@ -20,6 +20,8 @@ KEPT_TO = 1e-3  # share of a limit by which a row that is read may be beyond it:
 MIN_FRICTION_MARGIN = "min_friction_margin"
 SPECTRAL_RADIUS = "spectral_radius"  # of which a plant that is unstable fails
 LIMIT_CYCLE = "limit_cycle"
+LOG_SENSITIVITY = "log_sensitivity"  # of the law, by a log of the fit
+LOG_AGREEMENT = "log_agreement"  # of that log with the model
 UNSTABLE_LOOP = "the loop is UNSTABLE"
 DESIGN_PLANT = "design plant"  # whose own limits are judged
 # Of which plants a check speaks: at the nominal parameters, at draws of them, those that were measured, or runs that
@@ -128,6 +130,12 @@ class Requirement(Result):
     def __post_init__(self) -> None:
         for name in ("limit", "value"):  # a whole number is read back as one with a point, and sealed so
             object.__setattr__(self, name, float(getattr(self, name)))
+
+    @property
+    def statement(self) -> tuple[str, str, str]:
+        """What the risk is of: all rows of the draws together, or of a measured response; each row of a log is one."""
+        of_log = self.name if self.name in (LOG_SENSITIVITY, LOG_AGREEMENT) else ""
+        return self.scope, self.plant if self.scope == "measured" else "", of_log
 
     @property
     def subject(self) -> str:

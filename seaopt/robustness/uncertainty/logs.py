@@ -10,6 +10,9 @@ radius R (`seaopt.frequency.residual`). Around the model's own response G the la
   1/M_s`, x being the radial bound of R, lie about the crossover, and turn about zero as the model's do;
 - *undecided* otherwise. Samples that were fitted are not independent: they can refute, and confirm nothing.
 
+Besides, a log may *contradict the model*, whether the law's Ms is kept or not (`agreement`): the other checks, which
+stand on the model alone, are then of another actuator. Each statement has its own share of the risk.
+
 A log whose input carries its noise judges nothing: where it was taken under a law (stated, or found in it), or the fit
 is of prediction errors, as of such logs. Where noise dominates G + E would tend to -1/C, whatever the plant is.
 
@@ -23,11 +26,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Int
 
 from seaopt.codec import OrInfinite
 from seaopt.control import Controller
@@ -35,6 +38,8 @@ from seaopt.control.laws.delay import find_given_drive_delay
 from seaopt.control.loops.measured.plant import hold_response
 from seaopt.errors import SeaoptError
 from seaopt.estimation import Experiment, Fit
+from seaopt.estimation.judgement.intervals import ROUGH
+from seaopt.estimation.result.covariance import take_root
 from seaopt.estimation.result.findings import Nuisance
 from seaopt.formatting import join_words
 from seaopt.frequency.residual import LENGTHS, ResidualResponse, find_feedback, measure_residual
@@ -44,13 +49,15 @@ from seaopt.logs.quality.faults import find_runs
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import has_friction
 from seaopt.records import record
+from seaopt.robustness.uncertainty.agreement import GRACE, Agreement, find_radius, judge_agreement, widen_by_model
 from seaopt.simulation import Clock, linearise, make_model
 
-REFUTE, CONFIRM = 0.01, 0.05  # the risk of a false statement
-GRACE = 0.05  # of Ms: an actuator is not its model to the last digit
+REFUTE, CONFIRM, CONTRADICT = 0.01, 0.05, 0.01  # the risk of a false statement: on the law, twice, and on the model
+EACH = CONTRADICT / LENGTHS  # of the last, of windows of one length
 LARGEST_DISC = 0.5  # of the distance from zero: where discs are larger, the log says nothing
 SMOOTH = 5  # lines of which the median disc decides whether one tells
 FEWEST_LINES = 8
+STEP = 3e-3  # of a parameter, by which its effect on a log is measured
 SHARED = 0.01  # of the samples: slices of one log have an end in common
 PERIODS = 120.0  # of the bandwidth in the longest window
 HIGHEST = 0.5  # of the Nyquist frequency of log and law: above, folding is no longer small
@@ -76,6 +83,7 @@ class LogVerdict:
     unit: str
     at_amplitude: bool  # friction is dry: at another amplitude the response is another one
     asked_hz: tuple[float, float] | None = None  # from where to where lines must keep the limit to confirm it
+    agreement: Agreement | None = None  # with the model, at a risk of CONTRADICT; None in an older file
 
 
 @record
@@ -130,8 +138,8 @@ def judge_log(
         runs = whole.runs
         if find_feedback(whole.command, whole.error, runs):
             return (), silent(why="looks like feedback")
-        judged = [_judge(controller, fit.parameters, part, part.runs, ms * (1.0 + GRACE)) for part in parts]
-        first = _judge(controller, fit.parameters, whole, runs, ms * (1.0 + GRACE))
+        judged = [_judge(controller, fit, part, part.runs, ms * (1.0 + GRACE)) for part in parts]
+        first = _judge(controller, fit, whole, runs, ms * (1.0 + GRACE))
     except SeaoptError as error:
         return (), silent(why="an error", detail=str(error))
     verdicts = tuple(verdict for verdict in (first, *judged) if verdict is not None)
@@ -218,6 +226,7 @@ class _WindowLines:
     """The lines of windows of one length at which a log can tell of a loop."""
 
     f: Lines
+    rows: Int[np.ndarray, " m"]  # among all lines
     loop: ComplexLines  # L as the model has it
     error: ComplexLines  # of it
     std: Lines
@@ -257,20 +266,18 @@ def _tell(
     if np.count_nonzero(usable) < FEWEST_LINES:
         return None
     first, last = np.flatnonzero(usable)[[0, -1]]
-    lines = (x[usable] for x in (f, loop, error, std, unseen, radius))
-    names = ("f", "loop", "error", "std", "unseen", "radius")
+    lines = (x[usable] for x in (f, np.arange(f.size), loop, error, std, unseen, radius))
+    names = ("f", "rows", "loop", "error", "std", "unseen", "radius")
     return _WindowLines(
         **dict(zip(names, lines, strict=True)), freedom=response.freedom, gapless=bool(np.all(usable[first:last]))
     )
 
 
-def _judge(
-    controller: Controller, params: ParameterSet, part: _Record, runs: list[slice], limit: float
-) -> LogVerdict | None:
+def _judge(controller: Controller, fit: Fit, part: _Record, runs: list[slice], limit: float) -> LogVerdict | None:
     """Return what a record says of a law; None where it says nothing."""
     responses = _measure(controller, part, runs)
     alpha = REFUTE / max(sum(response.frequency_hz.size for response in responses), 1)
-    readable = [_tell(controller, params, part, response, alpha) for response in responses]
+    readable = [_tell(controller, fit.parameters, part, response, alpha) for response in responses]
     kinds = [lines for lines in readable if lines is not None]
     if not kinds:
         return None
@@ -295,7 +302,89 @@ def _judge(
         unit=controller.command.unit,
         at_amplitude=part.dry,
         asked_hz=_ask_band(controller, surest) if independent else None,
+        agreement=_compare(controller, fit, part, runs, readable),
     )
+
+
+def _compare(
+    controller: Controller, fit: Fit, part: _Record, runs: list[slice], readable: list[_WindowLines | None]
+) -> Agreement:
+    """Return whether a record agrees with the model, by the windows that say most."""
+    count = sum(run.stop - run.start for run in runs)
+    wider, found = widen_by_model(_find_excess(fit, part), count), list[Agreement]()
+
+    @cache
+    def measure() -> list[list[ResidualResponse]]:
+        return [_measure(controller, moved, runs) for moved in _move(fit, part)]
+
+    def move(k: int, lines: _WindowLines) -> Complex[np.ndarray, "k m"]:
+        c = _weigh(controller, part, lines.f)
+        moves = [np.sum(c * responses[k].model[:, lines.rows], axis=0) for responses in measure()]
+        return np.array(moves).reshape(-1, lines.f.size)
+
+    for k, lines in enumerate(readable):
+        if lines is not None:
+            found.append(
+                judge_agreement(
+                    lines.f,
+                    lines.loop,
+                    lines.error,
+                    wider * lines.std,
+                    lines.unseen,
+                    freedom=lines.freedom,
+                    alpha=EACH,
+                    move=partial(move, k, lines),
+                )
+            )
+    return max(found, key=lambda agreement: agreement.misfit / agreement.allowed)
+
+
+def _find_excess(fit: Fit, part: _Record) -> float | None:
+    """Return how many times their noise the fit's residuals of a record's outputs are, at most; None if not known."""
+    of_plant = [name for name, own in fit.nuisance.items() if own.plant in ("", part.experiment.plant.name)]
+    fitted = [
+        output
+        for name in of_plant
+        for output_name, output in fit.outputs.get(name, {}).items()
+        if output_name in part.names
+    ]
+    return max((output.excess for output in fitted if output.excess is not None), default=None)
+
+
+def _move(fit: Fit, part: _Record) -> Iterator[_Record]:
+    """Yield what a std along each axis of the fit's covariance, of noise and model, changes of a record's outputs: of
+    the parameters, as far as those of a fit that is met are off, and of the delay where it is one of the fit's.
+    """
+    own, joint = part.nuisance, fit.total_delay_covariance
+    covariance = fit.total_covariance if joint is None else joint
+    of_delay = [f"{name}.delay_s" for name, each in fit.nuisance.items() if each.delay_s == own.delay_s]
+    places = {name: k for k, name in enumerate(covariance.names) if np.isfinite(covariance.std(name))}
+    late = [name for name in of_delay if name in places][:1]
+    names = [name for name in places if name in fit.parameters]
+    rows = [places[name] for name in (*names, *late)]
+    values = np.array([*fit.parameters.values_of(names), *([own.delay_s] * len(late))])
+    noise = [*map(fit.covariance.std, names), *([np.inf] * len(late))]
+    most = np.maximum(ROUGH / find_radius(max(len(rows), 1), EACH) * np.abs(values), noise)
+    root = take_root(covariance.matrix[np.ix_(rows, rows)])
+    root *= np.minimum(1.0, most / np.maximum(np.linalg.norm(root, axis=1), 1e-300))[:, None]
+    low = np.array([*(fit.parameters[name].min for name in names), *([0.0] * len(late))])
+    high = np.array([*(fit.parameters[name].max for name in names), *([np.inf] * len(late))])
+    scale, gain = np.maximum(np.abs(values), np.linalg.norm(root, axis=1)), [own.gain[name] for name in part.names]
+    for axis in root.T[np.any(root != 0.0, axis=0)]:
+        step = STEP / np.max(np.abs(axis[scale > 0.0]) / scale[scale > 0.0])
+        inside = [np.all((low <= at) & (at <= high)) for at in (values + step * axis, values - step * axis)]
+        step = -step if inside == [False, True] else step
+        moved = dict(zip((*names, *late), np.clip(values + step * axis, low, high).tolist(), strict=True))
+        delay_s = moved.pop(late[0]) if late else own.delay_s
+        at = replace(
+            fit,
+            parameters=fit.parameters.update(**moved),
+            experiments=(part.experiment,),
+            nuisance={part.experiment.name: replace(own, delay_s=delay_s)},
+        )
+        outputs = at.predict(part.experiment).model
+        change = np.array([outputs[name] for name in part.names]) / np.array(gain)[:, None] - part.model
+        yield replace(part, model=change / step, error=change / step)
 
 
 def _bound_ms(lines: _WindowLines, limit: float) -> tuple[float, int]:

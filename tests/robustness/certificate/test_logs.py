@@ -15,9 +15,11 @@ from seaopt.errors import LogError
 from seaopt.files import to_json
 from seaopt.frequency.residual import find_feedback, measure_residual
 from seaopt.problem.stages import certify_problem
-from seaopt.robustness.certificate.limits import LOG_SENSITIVITY, describe_log
+from seaopt.robustness.certificate.limits import describe_log
+from seaopt.robustness.certificate.requirement import LOG_AGREEMENT, LOG_SENSITIVITY
 from seaopt.robustness.certificate.simulated import STEPS
-from seaopt.robustness.uncertainty.logs import GRACE, SilentLog, judge_log
+from seaopt.robustness.uncertainty.agreement import GRACE, judge_agreement, widen_by_model
+from seaopt.robustness.uncertainty.logs import CONTRADICT, SilentLog, judge_log
 from tests.checks import leave_out
 
 RATE, SECONDS, MODE_HZ, ZETA, NOISE = 1000.0, 20.0, 40.0, 0.02, 2.0
@@ -43,12 +45,13 @@ def sampled_stand(params, size):
     return np.ravel(b), a
 
 
-def record(params, size=0.0, seed=1, amplitude=2.0):
+def record(params, size=0.0, seed=1, amplitude=2.0, gain=1.0, late=0):
     rng, time = np.random.default_rng(seed), np.arange(round(SECONDS * RATE)) / RATE
     growth = np.log(1000.0)
     phase = 2 * np.pi * 0.1 * SECONDS / growth * np.expm1(growth * time / SECONDS)
     current = amplitude * np.sin(phase) + rng.normal(scale=0.25 * amplitude, size=time.size)
-    force = scipy.signal.lfilter(*sampled_stand(params, size), current) + rng.normal(scale=NOISE, size=time.size)
+    felt = gain * np.concatenate([np.zeros(late), current[: current.size - late]])
+    force = scipy.signal.lfilter(*sampled_stand(params, size), felt) + rng.normal(scale=NOISE, size=time.size)
     return so.Log.from_arrays(time=time, I=current, F1=force)
 
 
@@ -83,8 +86,8 @@ def certify(controller, stand, fit):
     return so.certify(controller, {"stand": stand}, fit, samples=20, simulations=False)
 
 
-def rows_of(certificate):
-    return [row for row in certificate.requirements if row.name == LOG_SENSITIVITY]
+def rows_of(certificate, name=LOG_SENSITIVITY):
+    return [row for row in certificate.requirements if row.name == name]
 
 
 def sensitivity(controller, params, size, f):
@@ -327,3 +330,89 @@ def test_of_logs_with_lagged_noise_hardly_one_has_a_line_outside_its_disc():
         read = [(each, *each.read(np.ones((1, each.frequency_hz.size), dtype=complex))) for each in found]
         outside += any(np.any(np.abs(e) > std * each.widen(alpha)) for each, _, e, std, _ in read)
     assert outside <= 3
+
+
+@pytest.fixture(scope="module")
+def judge_slow(stand, thor):
+    """Certify a law of 4 Hz, whose Ms hardly feels by what another actuator is off, on a fit with its intervals."""
+    start = thor.update(J=3e-6).free("J", "b_r", "eta")
+    spec = so.ControllerSpec(bandwidth_hz=4, bandwidth_range_hz=(1, 60), max_sensitivity=1.9, max_noise_gain=1.0)
+
+    def judge(fitted=(), validate=()):
+        logs = {"chirp": {}} | {f"fitted{k}": each for k, each in enumerate(fitted)}
+        others = {f"other{k}": each for k, each in enumerate(validate)}
+        experiments, validation = (
+            [so.Experiment(plant=stand, log=record(thor, **each), name=name) for name, each in part.items()]
+            for part in (logs, others)
+        )
+        fit = so.fit(experiments, start, validation=validation)
+        return certify(so.tune(stand, fit.parameters, spec), stand, fit)
+
+    return judge
+
+
+@pytest.mark.parametrize("off", [{"gain": 0.5}, {"late": 3}])
+def test_log_of_another_actuator_whose_loop_keeps_its_limit_fails_by_name(judge_slow, off):
+    certificate = judge_slow(validate=[{"seed": 2} | off])
+    (_, kept), (right, row) = rows_of(certificate), rows_of(certificate, LOG_AGREEMENT)
+    assert kept.met and right.met and not row.met and not certificate.met
+    assert (row.plant, row.scope, row.risk, right.risk) == ("log:other0", "measured", 0.01, None)
+    found = certificate.logs[1].agreement
+    assert found.contradicts and (found.misfit, found.allowed) == (row.value, row.limit)
+    expected = 0.5 if "gain" in off else abs(np.expm1(-2j * np.pi * found.off_hz * 3e-3))
+    assert 0.3 * expected < found.off < 1.1 * expected
+    assert "log:other0: validate, contradicts the model: its response is off by" in row.where
+
+
+def test_fitted_log_of_another_actuator_fails_by_name_too(judge_slow):
+    rows = rows_of(judge_slow(fitted=[{"seed": 2, "gain": 0.5}]), LOG_AGREEMENT)
+    assert {row.plant for row in rows if not row.met} == {"log:chirp"}  # the fit is of the other one
+    assert all(row.risk is None for row in rows)
+
+
+def test_right_log_and_one_that_is_off_by_less_than_the_grace_agree_and_risks_add_up(judge_slow):
+    certificate = judge_slow(validate=[{"seed": 2}, {"seed": 3, "gain": 0.97}, {"seed": 4, "amplitude": 1.0}])
+    rows = rows_of(certificate, LOG_AGREEMENT)
+    assert len(rows) == 4 and all(row.met for row in rows)
+    assert "log:other0: validate, agrees with the model" in rows[1].where
+    each_log = [row.risk for row in rows_of(certificate) if row.risk is not None]
+    draws = 1.0 - certificate.monte_carlo.confidence
+    assert certificate.risk == pytest.approx(sum(each_log) + 3 * 0.01 + draws, rel=1e-9)
+    assert certificate.to_dict()["risk"] == certificate.risk
+
+
+def contradicts(seed, off, known):
+    """Return whether windows of any length of a log whose gain is off contradict a fit that knows it to `known`."""
+    rng, n, (b, a) = np.random.default_rng(seed), 6000, scipy.signal.butter(2, 0.1)
+    u = rng.normal(size=n)
+    model = scipy.signal.lfilter(b, a, u)
+    error = off * model + scipy.signal.lfilter([1.0], [1.0, -0.6], rng.normal(scale=0.1, size=n))
+    found = measure_residual(u, model[None], error[None], 1e-3, [slice(0, n)], longest_s=0.5, highest_hz=100.0)
+    for each in found:
+        loop, left, sigma, unseen = each.read(np.ones((1, each.frequency_hz.size), dtype=complex))
+        agreement = judge_agreement(
+            each.frequency_hz, 3.0 * loop, 3.0 * left, 3.0 * sigma, 3.0 * unseen,
+            freedom=each.freedom, alpha=CONTRADICT / len(found), move=lambda loop=loop: 3.0 * known * loop[None],
+        )  # fmt: skip
+        if agreement.contradicts:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("std", [0.0, 0.03, 0.3])
+def test_of_right_logs_hardly_one_contradicts_what_the_fit_knows(std):
+    """At 1 % of a log: of 200 logs 6 or more with a probability below 2 %."""
+    off = std * np.random.default_rng(7).normal(size=200)
+    assert sum(contradicts(seed, each, std) for seed, each in enumerate(off)) <= 5
+
+
+@pytest.mark.parametrize("off", [-0.5, 0.2, 0.5])
+def test_gain_beyond_its_interval_contradicts(off):
+    assert all(contradicts(seed, off, 0.01) for seed in range(20))
+    assert not any(contradicts(seed, off, 0.5) for seed in range(20))
+
+
+def test_error_of_the_model_widens_up_to_what_a_met_fit_may_leave():
+    assert widen_by_model(0.98, 8000) == 1.0
+    assert widen_by_model(1.2, 8000) == pytest.approx(np.sqrt(1 + (1 - 1 / 1.44) * 100))
+    assert widen_by_model(None, 8000) == widen_by_model(7.0, 8000) == widen_by_model(1.5, 8000)

@@ -55,6 +55,7 @@ REMEDIES = {
     "constrained_failure_probability": "more constrained_runs in [robustness]",
     "min_schedule_rate": "a smaller min_rate in [controller.schedule], or a higher bandwidth_hz",
     "log_sensitivity": "seaopt fit --explain, which names what the model may lack, or a lower bandwidth_hz",
+    "log_agreement": "seaopt fit with that log, too, or --explain; another actuator, or a column in another unit?",
     "limit_cycle": "a lower bandwidth_hz, or min_friction_margin in [controller]",
 }
 SLOWER = "a lower bandwidth_hz, or more reserve, in [controller]"
@@ -75,6 +76,7 @@ CAUSES = {
 }
 
 
+RISK = "By chance one of what states a risk is wrong with a probability of {:.2g} at most, the sum of these shares."
 # The limits that keep the feedback from doing more, by what asks it to.
 MORE_FEEDBACK = ("max_sensitivity", "max_complementary", "min_disk_margin", "max_noise_gain", OTHER_NOISE)
 EASED_BY: dict[str, tuple[str, ...]] = {"step_settling_s": MORE_FEEDBACK, "steady_error": MORE_FEEDBACK}
@@ -416,7 +418,7 @@ def _list_requirements(certificate: Certificate) -> Section:
         part="certificate",
         screen=False,
         tables=(Table(head=head, rows=rows, align="<<>><<"),),
-        remarks=(remark,),
+        remarks=(remark, *([RISK.format(certificate.risk)] if certificate.risk else ())),
     )
 
 
