@@ -9,6 +9,10 @@ removes the excess the rate is the one that leaves the least. Inputs that are st
 with a free shift of its rows, the logs have to be nearer to the interpolated ones than to these. Where neither is
 nearer the rate is named beside the other causes, and where the shift is it is not.
 
+A delay that is free makes up for it so well that there is hardly an excess: with twice the values a row it is a quarter
+of a row longer. One step from the minimum tells whether the logs speak against that. Where they do not the intervals
+reach to the values with that, and where they speak for it the rate is named.
+
 Of one that changes from tick to tick, as binary noise, the rows tell nothing about what lies between them. With
 the spectrum F of what is white in the rows, and S of all of them, the outputs follow the rows at a frequency only to
 
@@ -40,8 +44,10 @@ from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.problem.noise_floor import NoiseFloor
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.problem.shapes import Signal, Vector
+from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.solver.least_squares import find_blocked
 from seaopt.estimation.solver.settle import measure_misfit, settle_roughly
 from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.records import record
@@ -65,8 +71,9 @@ class UnloggedCommand:
 
     findings: tuple[FitFinding, ...]
     # "certain": nothing else is to be looked for; "likely": hardly anything, and what leaves an excess is no cause;
-    # "possible": inputs that are stamped late explain as much
+    # "possible": something else explains as much
     standing: Literal["certain", "likely", "possible"]
+    values: Mapping[str, float] | None = None  # of all unknowns, to which their intervals are to reach
 
 
 def find_unlogged_command(
@@ -79,16 +86,18 @@ def find_unlogged_command(
     experiments = [e.data for e in minimum.problem.experiments]
     plain = all(e.hold == "zero" and not e.feedback and len(e.log_segments) == e.shots == 1 for e in experiments)
     first = max(excess.values(), default=0.0)
-    if first <= FAR or not plain or minimum.problem.predicts or any(e.plant.followed for e in experiments):
+    if not plain or minimum.problem.predicts or any(e.plant.followed for e in experiments):
         return None
     commands = [e.log[name] for e in experiments for name in _list_commands(e)]
     if not commands or not all(np.all(np.isfinite(command)) for command in commands):
         return None
     if all(map(_is_smooth, commands)):
         try:
-            return _fill_rows(fit, minimum, floors, first)
+            return _weigh_rates(fit, minimum) if first <= FAR else _fill_rows(fit, minimum, floors, first)
         except SeaoptError:  # nothing that can be simulated, or in time
             return None
+    if first <= FAR:
+        return None
     octaves = ((e.data, measure_octaves(e, residuals[e.name], floors[e.name])) for e in minimum.problem.experiments)
     white = tuple(finding for e, each in octaves if (finding := _find_white(e, each)) is not None)
     return UnloggedCommand(findings=white, standing="likely") if white else None
@@ -145,6 +154,40 @@ def _fill_rows(fit: Fit, minimum: Minimum, floors: Mapping[str, NoiseFloor], fir
     return UnloggedCommand(findings=findings, standing="certain" if certain else "possible")
 
 
+def _weigh_rates(fit: Fit, minimum: Minimum) -> UnloggedCommand | None:
+    """Return what the logs tell of commands that are had back between their rows, where free delays may make up for
+    them; None where they speak against those.
+    """
+    problem, colour = minimum.problem, measure_colour(fit.covariance, fit.white_covariance)
+    if fit.status != "converged" or any(e.slots.delay.index is None for e in problem.experiments):
+        return None
+    fitted, enough = problem.evaluate(minimum.z), ENOUGH * colour
+    best, found, nearer = fitted, RATES[0], -np.inf
+    for count in RATES:
+        filled, start = _pose_filled(problem, minimum.z, count)
+        evaluation = filled.evaluate(start)
+        free = ~find_blocked(evaluation, filled.unknowns.low, filled.unknowns.high)
+        promised = fitted.cost - evaluation.cost + 0.5 * evaluation.distance_squared(free)
+        if not promised > max(nearer, -enough):
+            break
+        evaluation = settle_roughly(filled, evaluation, checked=True).solution.evaluation
+        gain = 0.5 * (measure_misfit(fitted) - measure_misfit(evaluation))
+        if not gain > max(nearer, -enough):
+            break
+        best, found, nearer = evaluation, count, gain
+        if nearer < enough:
+            break
+    if not np.isfinite(nearer):
+        return None
+    values = problem.unknowns.by_name(best.z)
+    if nearer < enough:
+        findings = tuple(_state_open(e.data, found) for e in problem.experiments)
+    else:
+        seen = f"with the values between interpolated the logs are e^{nearer:.3g} times as likely, and the delay longer"
+        findings = tuple(_state(e.data, found, seen, READING, certain=False) for e in problem.experiments)
+    return UnloggedCommand(findings=findings, standing="possible", values=values)
+
+
 def _refit_late(problem: FitProblem, z: Vector, count: int) -> Evaluation:
     """Return a rough minimum with the rows of each input as they are, and as much earlier or later as suits the
     outputs: from where so many values of each would put them.
@@ -171,13 +214,7 @@ def _refit(problem: FitProblem, z: Vector, count: int, least: float) -> Evaluati
     """Return a rough minimum with so many values of each command a row, the outputs as they are; None where a few
     iterations come to no less of a misfit.
     """
-    data = {e.name: _fill(e.data, count) for e in problem.experiments}
-    filled, start = problem.rebuild(problem.params, z, data)
-    start, low = start.copy(), filled.unknowns.low
-    for e in filled.experiments:  # what the fit's delay lacks, but for a bound
-        place = e.slots.delay.index
-        if place is not None and start[place] > low[place]:
-            start[place] += 0.5 * (count - 1) * e.period
+    filled, start = _pose_filled(problem, z, count)
     points = 0
 
     def ends(evaluation: Evaluation) -> bool:
@@ -185,9 +222,20 @@ def _refit(problem: FitProblem, z: Vector, count: int, least: float) -> Evaluati
         points += 1
         return points > FIRST and not measure_misfit(evaluation) < least
 
-    filled = copy_steps(filled, problem)
     found = settle_roughly(filled, filled.evaluate(start), ends=ends, checked=True).solution.evaluation
     return found if np.isfinite(found.cost) else None
+
+
+def _pose_filled(problem: FitProblem, z: Vector, count: int) -> tuple[FitProblem, Vector]:
+    """Return the problem with so many values of each command a row, the outputs as they are, and where it begins."""
+    data = {e.name: _fill(e.data, count) for e in problem.experiments}
+    filled, start = problem.rebuild(problem.params, z, data)
+    start, low = start.copy(), filled.unknowns.low
+    for e in filled.experiments:  # what the fit's delay lacks, but for a bound
+        place = e.slots.delay.index
+        if place is not None and start[place] > low[place]:
+            start[place] += 0.5 * (count - 1) * e.period
+    return copy_steps(filled, problem), start
 
 
 def _fill(experiment: Experiment, count: int) -> Experiment:
@@ -242,4 +290,16 @@ def _state(experiment: Experiment, count: int, seen: str, besides: str = "", *, 
         f"of the log: at about {count * logged_hz:.4g} Hz, {count} values for each that is logged ({seen}); log every "
         f"tick, or command at the log's rate{besides}",
         rate_hz=count * logged_hz,
+    )
+
+
+def _state_open(experiment: Experiment, count: int) -> FitFinding:
+    period = experiment.log.period
+    return FitFinding(
+        severity="note",
+        kind="command",
+        where=experiment.name,
+        text=f"the log does not tell whether the command was held at its rate of {1.0 / period:.4g} Hz or at a faster "
+        f"one: at {count * 1.0 / period:.4g} Hz the delay would be {500.0 * (1.0 - 1.0 / count) * period:.3g} ms "
+        "longer, which its interval allows for; one with more at high frequencies would tell",
     )

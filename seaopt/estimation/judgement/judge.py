@@ -118,6 +118,8 @@ def judge(
     with limit_evaluations(TESTS * evaluations):
         command = find_unlogged_command(fit, residuals, floors, error.excess)
     standing = None if command is None else command.standing
+    if command is not None and command.values is not None:
+        fit = _widen_to(fit, command.values)
     testing(f"trying another start, at most {evaluations} evaluations", 0.5)
     with limit_evaluations(TESTS * evaluations):
         another = [] if standing == "certain" else list(find_other_minimum(fit))
@@ -260,16 +262,21 @@ def _tells(fit: Fit, validation: Experiment) -> bool:
 def _reach(
     fit: Fit, findings: Sequence[FitFinding], error: ModelError, *others: Mapping[str, float]
 ) -> tuple[Fit, list[FitFinding]]:
+    """Return the fit with intervals that reach to other values, and its findings with what is then known roughly."""
+    fit = _widen_to(fit, *others)
+    return fit, [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
+
+
+def _widen_to(fit: Fit, *others: Mapping[str, float]) -> Fit:
     """Return the fit with intervals that reach to other values of its parameters and delays, by what they differ the
-    most, and the findings with what is then known only roughly.
+    most.
     """
     noise = fit.covariance if fit.delay_covariance is None else fit.delay_covariance
-    minimum = fit.require_minimum("_reach")
+    minimum = fit.require_minimum("_widen_to")
     before = minimum.problem.unknowns.by_name(minimum.z)
     apart = [[values.get(name, before[name]) - before[name] for values in others] for name in noise.names]
     shift = np.array([max(each, key=abs) for each in apart])
-    fit = widen(fit, np.outer(shift, shift))
-    return fit, [*(each for each in findings if each.kind != "rough"), *find_rough(fit, error)]
+    return widen(fit, np.outer(shift, shift))
 
 
 def _state_excess(fit: Fit, excess: Mapping[str, float]) -> Fit:

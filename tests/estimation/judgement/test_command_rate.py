@@ -5,6 +5,7 @@ The actuators are integrated here at the command's own rate, in NumPy, and rows 
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
@@ -134,3 +135,42 @@ def test_each_log_has_a_rate_of_its_own(play):
     fit, _, _ = fit_logs(make_log(play(), 2), slow)
     rates = {each.where: each.rate_hz for each in fit.findings if each.kind == "command"}
     assert rates == {"log-0": TICK_HZ, "log-1": TICK_HZ / 2}
+
+
+def fit_late(current, every, delay_ticks, *, noise=1.0):
+    """Return the fit of a log of every so many ticks, whose outputs follow the command after a delay, which is free."""
+    acted = np.concatenate([np.zeros(delay_ticks), current])[: current.size]
+    columns = knee(acted, TICK_HZ, locked=True, noise=noise, **KNEE | {"f_c": 0.0})
+    rows = np.arange(0, current.size, every)
+    outputs = {name: columns[name][rows] for name in ("tau_s", "theta_m")}
+    delay = so.Parameter(name="delay", value=1e-3, unit="s", min=0.0, max=0.02, free=True)
+    log = so.Log.from_arrays(time=rows / TICK_HZ, I=current[rows], **outputs)
+    fit = fit_logs(log, delay_s=delay)[0]
+    nuisance = fit.nuisance["experiment"]
+    return fit, nuisance.delay_s, math.hypot(nuisance.std["delay_s"], nuisance.model_std["delay_s"])
+
+
+@pytest.mark.parametrize(("every", "ticks", "top_hz"), [(2, 2, 60.0), (2, 5, 8.0), (4, 6, 20.0)])
+def test_a_delay_that_makes_up_for_what_lies_between_the_rows_is_named(every, ticks, top_hz):
+    """It ended half a tick short, 1.5008 +- 0.0004 ms of 2, and met, where the residual is hardly above the noise."""
+    fit, delay, std = fit_late(play_multisine(top_hz), every, ticks)
+    assert abs(delay - ticks / TICK_HZ) < 1.96 * std
+    (finding,) = (each for each in fit.findings if each.kind == "command")
+    assert finding.severity == "warning" and "may have been held at a faster rate" in finding.text
+    assert every / 2 <= finding.rate_hz * every / TICK_HZ <= every + 1
+
+
+@pytest.mark.parametrize(("every", "ticks", "top_hz"), [(2, 2, 60.0), (2, 4, 8.0), (4, 8, 20.0), (3, 6, 30.0)])
+def test_a_command_held_at_the_rate_of_its_log_keeps_its_delay(every, ticks, top_hz):
+    fit, delay, std = fit_late(np.repeat(play_multisine(top_hz)[::every], every), every, ticks)
+    assert fit.met and not [each for each in fit.findings if each.kind == "command"]
+    assert std < 1e-5 and abs(delay - ticks / TICK_HZ) < 4.0 * std
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_the_interval_has_both_delays_where_the_log_does_not_tell(held):
+    current = play_multisine(3.0)
+    fit, delay, std = fit_late(np.repeat(current[::2], 2) if held else current, 2, 4)
+    assert fit.met and abs(delay - 4e-3) < 1.96 * std < 1.1e-3
+    (finding,) = (each for each in fit.findings if each.kind == "command")
+    assert finding.severity == "note" and finding.rate_hz is None
