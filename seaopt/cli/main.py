@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from seaopt.cli.terminal import Amount, add_remedy, end, leave_pipe, list_notes, prepare_streams
-from seaopt.errors import ControlError, InternalError, SeaoptError
+from seaopt.errors import ControlError, InternalError, ProblemError, SeaoptError
 from seaopt.formatting import printable
 
 if TYPE_CHECKING:
@@ -322,11 +322,17 @@ def fit(
             "--explain", help="Add what the model lacks, where that is found, and fit again; write explained.toml."
         ),
     ] = False,
+    no_causes: Annotated[
+        bool, typer.Option("--no-causes", help="Do not look for what the model may lack, as causes = false in [fit].")
+    ] = False,
 ) -> None:
     """Fit the parameters to the logs; write fit.json."""
     from seaopt.cli.session import Session
 
-    _run_stage(Session(problem, output, design=False, explain=explain), "fit", json, quiet, verbose)
+    if explain and no_causes:
+        raise ProblemError("--explain looks for what the model lacks; leave --no-causes out")
+    session = Session(problem, output, design=False, explain=explain, causes=not no_causes)
+    _run_stage(session, "fit", json, quiet, verbose)
 
 
 _add_stage("report", "Write report.html and figures from the results in DIR.")

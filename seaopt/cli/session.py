@@ -94,6 +94,7 @@ class Session:
         workers: int | None = None,
         design: bool = True,
         explain: bool = False,
+        causes: bool = True,
     ) -> None:
         check_folder(folder)
         self.problem: Problem = read_problem(problem, design=design)
@@ -106,6 +107,7 @@ class Session:
         self.bandwidths_hz = bandwidths_hz
         self.free_law = free_law
         self.explain = explain
+        self.causes = causes
         self.workers = workers
         self.executor: Executor | None = None
         self._stages = Stages(self.problem)
@@ -340,7 +342,9 @@ class Session:
         reading, fitting, again = divide(tell, READING, 1.0 - READING, 1.0 if self.explain else 0.0)
         reading("reading logs", 0.0)
         experiments, start = self.experiments(), self._find_earlier_fit()
-        result = fit_problem(self.problem, experiments, start=start, keep=self._keep_fit, progress=fitting)
+        result = fit_problem(
+            self.problem, experiments, start=start, causes=self.causes, keep=self._keep_fit, progress=fitting
+        )
         if self.explain:
             trial = find_explanation(result)
             if trial is None:

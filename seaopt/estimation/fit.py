@@ -58,6 +58,7 @@ def fit(
     band_hz: tuple[float, float] | None = None,
     holdout: float = 0.0,
     diagnostics: bool = True,
+    causes: bool = True,
     alternatives: Sequence[Plant] = (),
     validation: Sequence[Experiment] = (),
     start: Fit | None = None,
@@ -84,6 +85,9 @@ def fit(
     diagnostics : bool
         False leaves out what needs the residuals of every sample: the stds are then those for white residuals, the
         outputs' figures are missing, and the fit is not judged.
+    causes : bool
+        False leaves out the search for what the model lacks, which takes most of the time of a fit that leaves
+        something; the fit's findings say so.
     alternatives : sequence of Plant
         Other plants that may have been on the bench: where a log is not explained, they are tried.
     validation : sequence of Experiment
@@ -160,7 +164,9 @@ def fit(
         if keep is not None:
             keep(replace(result, findings=order_findings((*result.findings, find_unjudged()))))
         if diagnostics:
-            judged = judge(result, alternatives, judging, validation, evaluations=evaluations, freed=freed)
+            judged = judge(
+                result, alternatives, judging, validation, causes=causes, evaluations=evaluations, freed=freed
+            )
             result = _name_guesses(judged, named, params)
     result = replace(result, validation=tuple(validation), holdout=holdout)
     if sharp:

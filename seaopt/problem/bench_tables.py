@@ -306,3 +306,4 @@ class FitTable(StrictTable):
     loss: Literal["linear", "huber", "soft_l1"] = key('"huber" or "soft_l1" with outliers.', default="linear")
     band_hz: tuple[Number, Number] | None = key("Residuals count in this band only.", default=None)
     holdout: Number = key("Last share of each log that is kept back, to judge the fit by.", default=0.0, ge=0, lt=1)
+    causes: bool = key("What the model may lack is looked for where the fit leaves something.", default=True)

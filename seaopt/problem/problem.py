@@ -100,6 +100,7 @@ class Problem:
             "loss": {"linear": Squares(), "huber": Huber(), "soft_l1": SoftL1()}[table.loss],
             "band_hz": table.band_hz,
             "holdout": table.holdout,
+            "causes": table.causes,
         }
 
     @property

@@ -73,6 +73,7 @@ def fit_problem(
     experiments: Sequence[Experiment] | None = None,
     *,
     start: Fit | None = None,
+    causes: bool = True,
     keep: Callable[[Fit], object] | None = None,
     progress: Progress = ignore,
 ) -> Fit:
@@ -86,6 +87,8 @@ def fit_problem(
         All of the problem's, where they are read already; read here if left out.
     start : Fit, optional
         An earlier fit of fewer logs, to go on from, as in `seaopt.fit`.
+    causes : bool
+        False leaves out the search for what the model lacks, whatever the problem says of it.
     keep, progress : callable, optional
         As in `seaopt.fit`.
 
@@ -100,6 +103,8 @@ def fit_problem(
     fitted = problem.choose_fitted(every)
     if not fitted:
         raise ProblemError(f'{problem.source}: every [[experiment]] has use = "validate"; fit one of them: use = "fit"')
+    options = problem.fit_options
+    options["causes"] = causes and options["causes"]
     result = fit(
         fitted,
         problem.parameters,
@@ -108,7 +113,7 @@ def fit_problem(
         progress=progress,
         alternatives=tuple(problem.plants.values()),
         validation=[experiment for experiment in every if experiment not in fitted],
-        **problem.fit_options,
+        **options,
     )
     guesses = find_guesses(problem.table.guessed)
     return replace(result, findings=order_findings((*result.findings, *guesses))) if guesses else result

@@ -9,8 +9,9 @@ from dataclasses import replace
 
 import pytest
 
+from seaopt.estimation.problem.fit_problem import count_evaluations
 from seaopt.estimation.result.trials import HypothesisTrial
-from seaopt.problem import read_problem
+from seaopt.problem import fit_problem, read_problem
 from seaopt.problem.explained import adopt, say_adopted, say_unexplained
 from tests.actuator_logs import write_csv
 from tests.estimation.judgement.test_hypotheses import TRUTH, record
@@ -70,6 +71,29 @@ def test_a_start_with_which_free_a_cause_was_found_is_freed_with_it(problem):
     found, lines = adopt(read_problem(problem), trial, ["log"])
     assert found.table.experiment[0].initial_state == "estimate"
     assert tomllib.loads(lines)["experiment"] == [{"name": "log", "initial_state": "estimate"}]
+
+
+def test_a_fit_may_leave_the_search_for_causes_out(problem, seaopt):
+    """The spring hardens, which the search finds after some hundred simulations."""
+    before = count_evaluations()
+    out = problem.parent / "out"
+    result = seaopt("fit", problem, "-o", out, "--no-causes")
+    assert count_evaluations() - before < 100
+    assert result.returncode == 1
+    assert "causes were not looked for" in result.stdout
+    fit = json.loads((out / "fit.json").read_text(encoding="utf-8"))
+    kinds = {finding["kind"] for finding in fit["findings"]}
+    assert "unsearched" in kinds and "excess" in kinds and not kinds & {"cause", "fixed", "budget"}
+
+    refused = seaopt("fit", problem, "-o", out, "--no-causes", "--explain")
+    assert refused.returncode == 2 and "leave --no-causes out" in refused.stderr
+
+
+def test_a_file_may_leave_the_search_for_causes_out(problem):
+    problem.write_text(problem.read_text(encoding="utf-8") + "[fit]\ncauses = false\n", encoding="utf-8")
+    fit = fit_problem(read_problem(problem))
+    assert not fit.hypotheses and any(each.kind == "unsearched" for each in fit.findings)
+    assert "causes were not looked for" in " ".join(repr(fit).split())
 
 
 def test_what_nothing_explains_is_said():

@@ -41,7 +41,14 @@ from seaopt.estimation.problem.fit_problem import BudgetError, limit_evaluations
 from seaopt.estimation.problem.noise_floor import NoiseFloor, measure_floors
 from seaopt.estimation.problem.normal_equations import invert
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
-from seaopt.estimation.result.findings import FitFinding, OutputFit, find_ended_search, find_energy, order_findings
+from seaopt.estimation.result.findings import (
+    FitFinding,
+    OutputFit,
+    find_ended_search,
+    find_energy,
+    find_unsearched,
+    order_findings,
+)
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.result.model_error import ModelError, estimate_model_error
 from seaopt.estimation.result.summary import summarise
@@ -88,6 +95,7 @@ def judge(
     progress: Progress = ignore,
     validation: Sequence[Experiment] = (),
     *,
+    causes: bool = True,
     evaluations: int = EVALUATIONS,
     freed: Freed | None = None,
 ) -> Fit:
@@ -95,9 +103,9 @@ def judge(
 
     `fit`: with its minimum; `alternatives`: other plants that may have been on the bench, tried where this one does
     not explain the logs; `validation`: logs that were not fitted, whose own values are compared with the fit's;
-    `evaluations`: what the fit took, of which the search for causes may take five times as many, and five times
-    `EVALUATIONS` where it took fewer (see `budget`), and another start once as many; `freed`: the minimum's problem
-    with what was fixed free, where that is at hand.
+    `causes`: whether to look for what the model lacks; `evaluations`: what the fit took, of which the search for causes
+    may take five times as many, and five times `EVALUATIONS` where it took fewer (see `budget`), and another start once
+    as many; `freed`: the minimum's problem with what was fixed free, where that is at hand.
     """
     minimum = fit.require_minimum("judge")
     evaluations = max(evaluations, EVALUATIONS)
@@ -139,8 +147,10 @@ def judge(
         *another,
     ]
     commanded = () if command is None else command.findings
-    if standing == "certain":
-        return _conclude(replace(fit, findings=order_findings([*findings, *commanded, *find_step_error(fit)])))
+    if standing == "certain" or not causes:
+        unsearched = () if causes else (find_unsearched(),)
+        every = [*findings, *commanded, *unsearched, *find_step_error(fit)]
+        return _conclude(replace(fit, findings=order_findings(every)))
     suspects = {name: test for name, test in _run_tests(fit, minimum, freed).items() if test.p < DOUBTFUL}
     if standing == "likely":
         evaluations = EVALUATIONS  # what brings a random force is hardly among the causes

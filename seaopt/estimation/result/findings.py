@@ -35,7 +35,7 @@ class FitFinding:
     severity: Severity  # error: do not use the fit; warning: look at it; note: for information
     # for programs: "bound", "budget", "cause", "command", "delay", "event", "excess", "explained", "fixed", "guess",
     # "held_out", "initial", "noise", "quantisation", "range", "residual", "rough", "samples", "sharp", "starts",
-    # "step", "unjudged"
+    # "step", "unjudged", "unsearched"
     kind: str
     where: str  # EXPERIMENT.OUTPUT, an experiment, a parameter, or empty
     text: str  # with the remedy
@@ -104,6 +104,17 @@ def find_unjudged() -> FitFinding:
         kind="unjudged",
         where="",
         text="it is not judged: what it leaves was still looked into as it was written; let the fit run to its end",
+    )
+
+
+def find_unsearched() -> FitFinding:
+    """Return a note that nobody has looked for what the model lacks."""
+    return FitFinding(
+        severity="note",
+        kind="unsearched",
+        where="",
+        text="what the model may lack was not looked for, as causes = false leaves that out: no cause is named, and "
+        "intervals do not reach to values that another cause would give",
     )
 
 

@@ -32,7 +32,7 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     if fit.met:
         ends = list(dict.fromkeys(f"{end:.1f}" for end in (min(percents), max(percents)))) if percents else []
         outputs = f", outputs fit to {' to '.join(ends)} %" if ends else ""
-        return Verdict(met=True, text=f"Fit: converged, {size}{outputs}{_name_silent(fit)}")
+        return Verdict(met=True, text=f"Fit: converged, {size}{outputs}{_name_silent(fit)}{_say_unsearched(fit)}")
     status = "" if fit.status == "converged" else f"{fit.status.replace('_', ' ')}, "
     errors = [(each.text, each.where) for each in fit.errors]
     if fit.status != "converged" and not _repeats(fit):
@@ -41,7 +41,8 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     again = [Step.typed("correct the file, then", commands.fit)] if commands.fit else []
     return Verdict(
         met=False,
-        text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met{_name_silent(fit)}",
+        text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met{_name_silent(fit)}"
+        f"{_say_unsearched(fit)}",
         reasons=reasons,
         next=(*_list_cures(fit, commands.plants), *again),
     )
@@ -103,6 +104,11 @@ def _name_silent(fit: Fit) -> str:
     """Return what the logs cannot tell, for the verdict; "" where there is nothing."""
     ties = [f"{join_words(list(each.shifts))} where {each.effect}" for each in fit.silent]
     return f"; cannot be told from such a log: {'; '.join(ties)}" if ties else ""
+
+
+def _say_unsearched(fit: Fit) -> str:
+    """Return that causes were not looked for, for the verdict; "" where they were, as far as the fit asked for it."""
+    return "; causes were not looked for" if any(each.kind == "unsearched" for each in fit.findings) else ""
 
 
 def _say_silent(fit: Fit) -> Iterator[str]:
