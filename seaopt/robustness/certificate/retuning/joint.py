@@ -37,7 +37,7 @@ from seaopt.robustness.certificate.certificate import Certificate
 from seaopt.robustness.certificate.certify import certify
 from seaopt.robustness.certificate.requirement import MIN_FRICTION_MARGIN
 from seaopt.robustness.certificate.retuning.relief import Relief, find_relief
-from seaopt.robustness.certificate.retuning.reserve import MOST_RESERVE, Look, look_at_draws, raise_reserve
+from seaopt.robustness.certificate.retuning.reserve import MOST_RESERVE, NEAR, Look, look_at_draws, raise_reserve
 from seaopt.robustness.uncertainty.draws import Plants, Ranges, Source
 from seaopt.robustness.uncertainty.severity import UNSTABLE
 from seaopt.robustness.uncertainty.worst import place_values
@@ -127,6 +127,8 @@ class JointTuning(Result):
             more = "what is compensated takes more of a limit than a reserve of"
             remedy = "" if self.relief else "compensate less"
             return f"{more} {100.0 * MOST_RESERVE:g} % makes room for: {replace(broken, remedy=remedy)}"
+        if not _list_over(self.certificate):
+            return f"draws keep Ms, Mt and stability, and tuning again for them mends nothing else: {broken}"
         return f"no witness is left that the tuner has not met: {broken}"
 
     @property
@@ -303,24 +305,28 @@ def _list_over(certificate: Certificate) -> list[Look]:
 def _list_new_witnesses(
     certificate: Certificate | None, tuned_on: Sequence[tuple[Plant, ParameterSet]], number: int
 ) -> dict[str, tuple[Plant, ParameterSet]]:
-    """Return the worst case of every plant, by name, but for those that the tuner knows; none if there is no need. Of
+    """Return the worst case of every plant, by name, and where its Ms and Mt are largest if that is near a limit, as
+    what mends one of them brings up the other; none that the tuner knows, and none where draws keep the limits. Of
     friction it is the draw with the least margin, where that is not what is asked.
     """
     if certificate is None or certificate.passed:
         return {}
-    cases: dict[str, tuple[Plant, ParameterSet, Mapping[str, float]]] = {
-        name: (worst[0], worst[1], worst.parameters) for name, worst in certificate.worst.items()
-    }
+    cases = [
+        (name, worst[0], place_values(worst[0], worst[1], each.parameters), each.parameters)
+        for name, worst in (certificate.worst.items() if _list_over(certificate) else ())
+        for each in (worst.witness, *worst.largest)
+        if each is worst.witness or each.severity > NEAR
+    ]
     for each in certificate.places or (certificate,):
         least = each.controller.spec.level(MIN_FRICTION_MARGIN)
         for name, draws in each.friction_draws.items():
             if least is not None and draws.least_slope < least:
                 plant = each.models[name]
                 values = place_values(plant, each.parameters, draws.parameters)
-                cases[f"{name}'s friction"] = (plant, values, draws.parameters)
+                cases.append((f"{name}'s friction", plant, values, draws.parameters))
     return {
         f"{name}, round {number}: {format_values(drawn, missing='nominal')}": (plant, values)
-        for name, (plant, values, drawn) in cases.items()
+        for name, plant, values, drawn in cases
         if not any(plant is other and _agree(values, at, drawn) for other, at in tuned_on)
     }
 
