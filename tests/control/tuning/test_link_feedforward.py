@@ -12,7 +12,12 @@ from scipy.linalg import expm
 import seaopt as so
 from seaopt.control import LinkFeedforward, runnable, sweep
 from seaopt.control.deploy.export import export
-from seaopt.control.loops.compensation.link_feedforward import LinkPath, model_link_path
+from seaopt.control.loops.compensation.link_feedforward import (
+    FollowedBand,
+    LinkEffect,
+    LinkPath,
+    model_link_path,
+)
 from seaopt.control.loops.loop import Loop
 from seaopt.control.tuning.frequencies import place_frequencies
 from seaopt.control.tuning.tuner import make_task
@@ -133,6 +138,21 @@ def test_what_it_costs_is_said_beside_the_law_without(fed, stand, swing, thor):
     assert "leave" not in note
     again = so.Controller.from_dict(json.loads(to_json(fed.to_dict())), stand, thor)
     assert again.link.effect == effect and note in again.notes
+
+
+def test_a_plant_that_loses_band_is_named_beside_one_that_wins():
+    bands = (
+        FollowedBand(plant="swing", band_hz=(4.0, 32.0), without_hz=(8.0, 32.0)),
+        FollowedBand(plant="light", band_hz=(24.0, 36.0), without_hz=(16.0, 36.0)),
+        FollowedBand(plant="heavy", band_hz=None, without_hz=None),
+    )
+    said = LinkEffect(objective="noise", cost=-0.031, bands=bands).describe()
+    assert said == (
+        "the noise gain is 3.1 % smaller than without it, and swing follows from 4 to 32 Hz, without it from 8 to 32 "
+        "Hz; light follows from 24 to 36 Hz, without it from 16 to 36 Hz"
+    )
+    nothing = LinkEffect(objective="disturbance", cost=0.05, bands=bands[1:]).describe()
+    assert nothing.endswith("without it from 16 to 36 Hz: no more of the band, so leave link_feedforward out")
 
 
 def test_a_path_that_wins_no_band_is_said_to_be_left_out(stand, swing, thor):

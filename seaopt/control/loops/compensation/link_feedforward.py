@@ -122,6 +122,10 @@ class FollowedBand:
         """By how many octaves it is wider than without the path."""
         return _count_octaves(self.band_hz) - _count_octaves(self.without_hz)
 
+    def describe(self) -> str:
+        """Say where references are followed, with the path and without."""
+        return f"{self.plant} follows {_say(self.band_hz)}, without it {_say(self.without_hz)}"
+
 
 @record
 class LinkEffect:
@@ -132,14 +136,19 @@ class LinkEffect:
     bands: tuple[FollowedBand, ...]  # of every plant whose link moves
 
     def describe(self) -> str:
-        """Say in one line what it costs, and where references are followed on the plant that gains least of it."""
+        """Say in one line what it costs, and where references are followed: on the first plant whose link moves, and on
+        the one that loses most of the band.
+        """
         what = "noise gain" if self.objective == "noise" else "integral of abs(S)"
         text = f"the {what} is {100 * abs(self.cost):.2g} % {'larger' if self.cost > 0 else 'smaller'} than without it"
         if not self.bands:
             return text
-        least = min(self.bands, key=lambda band: band.octaves_won)
-        text += f", and {least.plant} follows {_say(least.band_hz)}, without it {_say(least.without_hz)}"
-        return text if least.octaves_won > 0.0 else f"{text}: no more of the band, so leave link_feedforward out"
+        first, least = self.bands[0], min(self.bands, key=lambda band: band.octaves_won)
+        text += f", and {first.describe()}"
+        if least is not first and least.octaves_won < 0.0:
+            text += f"; {least.describe()}"
+        won = any(band.octaves_won > 0.0 for band in self.bands)
+        return text if won else f"{text}: no more of the band, so leave link_feedforward out"
 
 
 def _count_octaves(band_hz: tuple[float, float] | None) -> float:
