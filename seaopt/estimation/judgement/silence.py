@@ -62,9 +62,7 @@ def _find_ties(fit: Fit, problem: FitProblem, freed: Freed, evaluation: Evaluati
         shift = -solve_seen(hessian[others][:, others], hessian[others, i], SOLVED)
         left = max(float(hessian[i, i] + hessian[i, others] @ shift), 0.0)
         moves = {names[k]: float(each) for k, each in zip(others, shift, strict=True) if names[k] in fit.parameters}
-        touched = {
-            name: move for name, move in moves.items() if abs(move) * size > TOUCHED * abs(fit.parameters[name].value)
-        }
+        touched = {name: move for name, move in moves.items() if abs(move) * size > _measure_least(fit, name)}
         if touched and size * np.sqrt(left) < SEEN:
             yield SilentEffect(
                 effect=addition.effect,
@@ -75,3 +73,10 @@ def _find_ties(fit: Fit, problem: FitProblem, freed: Freed, evaluation: Evaluati
                 shifts=touched,
                 seen=size * float(np.sqrt(left)),
             )
+
+
+def _measure_least(fit: Fit, name: str) -> float:
+    """Return by how much a value has to move to be named; one that is as good as zero by its standard deviation."""
+    parameter = fit.parameters[name]
+    value, std = abs(parameter.value), parameter.std or 0.0
+    return max(TOUCHED * value, std) if value < 2.0 * std else TOUCHED * value

@@ -70,6 +70,16 @@ def follow(result, part, size):
     return {name: result.parameters[name].value + shift * size for name, shift in silent.shifts.items()}
 
 
+def test_friction_that_is_none_is_not_touched(monkeypatch):
+    """A value of zero, on its bound, was named as touched by what moves it by 1e-17."""
+    monkeypatch.setitem(ROTARY, "f_c", 0.0)
+    result = fit(record(), free=("J_m", "b_r", "f_c", "k_s", "eta"))
+    assert abs(result.parameters["f_c"].value) < 3.0 * result.parameters["f_c"].std
+    assert {part: set(shifts) for part, shifts in ((each.part, each.shifts) for each in result.silent)} == {
+        "stand": {"k_s"}, "back_driving": {"J_m", "b_r", "eta"},
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize("linear", [False, True])
 def test_a_stand_in_series_is_said_to_touch_the_stiffness(linear):
     result = fit(record(linear=linear, give=0.04), linear=linear)
