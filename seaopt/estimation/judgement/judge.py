@@ -79,6 +79,7 @@ SYSTEMATIC = ((1.0, 3e-3), (5.0, 1e-4))
 SMALL = 1e-5  # below which a systematic residual is worth no word
 HELD_OUT = 0.9  # of the share explained over the samples used
 WORSE_HELD_OUT = 2.0  # times the rms over the samples used
+NOISE_HELD_OUT = 1.2  # times the sensor's noise, up to which what is left of samples held out is that
 APART_STDS, APART = 4.0, 0.1  # standard deviations and periods by which delays of one plant may differ
 HARDLY = 0.02  # half of an interval over its value, from which what is told apart weakly may be far off
 TICK = 0.1  # of a sample, by which a delay may be beyond its bound
@@ -133,7 +134,7 @@ def judge(
         another = [] if standing == "certain" else list(find_other_minimum(fit))
     findings = [
         *_find_unexplained(fit, shares, error.excess),
-        *_find_held_out(fit),
+        *_find_held_out(fit, minimum.problem.holdout),
         *_find_at_bound(fit, minimum),
         *_find_implausible(fit),
         *_find_contradicting_delays(fit),
@@ -414,20 +415,31 @@ def _explain_worse(fit: Fit, where: str) -> str:
     )
 
 
-def _find_held_out(fit: Fit) -> Iterator[FitFinding]:
+def _find_held_out(fit: Fit, holdout: float) -> Iterator[FitFinding]:
     """Yield outputs that are explained far less where they were held out."""
     for where, fitted in _list_outputs(fit):
         if fitted.holdout_fit_percent is None or not math.isfinite(fitted.holdout_fit_percent):
             continue
         held_out, used = find_energy(fitted.holdout_fit_percent), find_energy(fitted.fit_percent)
         worse = (1.0 - held_out) / max(1.0 - used, 1e-300)
-        if worse >= WORSE_HELD_OUT**2 and held_out <= 0.99 * used:
+        if worse >= WORSE_HELD_OUT**2 and held_out <= 0.99 * used and not _leaves_noise(fit, where, holdout):
             text = (
                 f"{100 * used:.4g} % is explained of the samples used and {100 * held_out:.4g} % of those held out: "
                 "the plant changed, is excited elsewhere, or the fit follows what does not repeat; log longer, or fix "
                 "parameters"
             )
             yield _warn("held_out", where, text, bad=held_out < HELD_OUT * used)
+
+
+def _leaves_noise(fit: Fit, where: str, holdout: float) -> bool:
+    """Tell whether what is left of an output's samples held out is its sensor's noise: a chirp that ends where the
+    plant hardly answers leaves little else to explain there.
+    """
+    experiment, output = next((e, y) for e in fit.experiments for y in e.outputs if f"{e.name}.{y}" == where)
+    fitted = fit.outputs[experiment.name][output]
+    spread = float(np.nanstd(experiment.log[output][experiment.count_fitted(holdout) :]))
+    left = (1.0 - (fitted.holdout_fit_percent or 0.0) / 100.0) * spread
+    return left <= NOISE_HELD_OUT * fitted.rms_residual / (fitted.excess or math.inf)
 
 
 def _find_at_bound(fit: Fit, minimum: Minimum) -> Iterator[FitFinding]:

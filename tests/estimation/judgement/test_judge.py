@@ -131,6 +131,28 @@ def test_another_plant_of_the_problem_is_named():
     assert swing.name in cause(result)
 
 
+def test_a_chirp_that_ends_in_noise_is_no_changed_plant():
+    """Held out is the end of the chirp, where the spring hardly answers; a spring that is a tenth softer there is."""
+    t, (inertia, damping, ratio, torque) = np.arange(16_000) / 1e3, (2e-5, 2e-4, 80.0, 0.1)
+    current = 2.0 * np.sin(2 * np.pi * (0.2 * t + 1.24 * t**2))
+    y, late = {}, 12_800
+    for stiffness in (250.0, 225.0):
+        a = np.array([[0.0, 1.0], [-stiffness / ratio**2 / inertia, -damping / inertia]])
+        system = (a, np.array([[0.0], [torque / inertia]]), np.array([[stiffness / ratio, 0.0]]), np.zeros((1, 1)))
+        a, b, c, d, _ = signal.cont2discrete(system, 1e-3)
+        y[stiffness] = signal.dlsim((a, b, c, d, 1e-3), current)[1][:, 0]
+    y[225.0] = np.r_[y[250.0][:late], y[225.0][late:]]
+    plant = so.plants.rotary(link="locked")
+    values = plant.defaults.update(J_m=inertia, b_r=damping, N=ratio, K_tau=torque, k_s=250.0, c_s=0.0, f_c=0.0)
+    for stiffness, said in ((250.0, False), (225.0, True)):
+        noisy = y[stiffness] + 0.05 * np.random.default_rng(1).normal(size=t.size)
+        log = so.Log.from_arrays(time=t, I=current, tau_s=noisy)
+        experiment = so.Experiment(plant=plant, log=log, outputs=("tau_s",), initial_state="rest")
+        result = so.fit([experiment], values.free("J_m", "b_r", "k_s"), holdout=0.2)
+        assert result.outputs[experiment.name]["tau_s"].holdout_fit_percent < 95
+        assert ("held_out" in {each.kind for each in result.findings}) == said
+
+
 @pytest.mark.usefixtures("without_hypotheses")
 def test_clipping_ahead_of_the_noise_is_found():
     columns, rng = bench(noise_n=0.0), np.random.default_rng(5)
