@@ -257,14 +257,16 @@ def _find_file(folder: Path, stage: str | None) -> Path:
 
 
 def _find_law(session: Session, stage: str | None) -> Source:
-    """Return the law of a folder, or that of a stage of its bring-up. Raises ProblemError: the stage has none."""
+    """Return the law of a folder, or that of a stage of its bring-up. Raises ProblemError: it has no such stage."""
     if stage is None:
         law = session.law()
         return law if session.problem.mpc is None else session.plan()
-    path = _find_file(session.folder, stage)
-    if not path.is_file():
-        raise ProblemError(f"stage {stage}: {path} is not there; make it: {session.spell('bringup')}")
-    return _read_stage(session, path)
+    folder = session.folder / BRING_UP
+    names = sorted(path.parent.name for path in folder.glob(f"*/{FILES['tune']}"))
+    if stage not in names:  # a name, never a path
+        remedy = f"there are {', '.join(names)}" if names else f"make it: {session.spell('bringup')}"
+        raise ProblemError(f"stage {stage}: {folder} has no stage of this name; {remedy}")
+    return _read_stage(session, _find_file(session.folder, stage))
 
 
 def _read_stage(session: Session, path: Path) -> Source:

@@ -1,7 +1,8 @@
 /* A ball-screw actuator between two fixed links under an exported law, with faults that a bench may have. Its equations
  * are written out here, and share nothing with seaopt:
  *   M q'' = kF i - b q' - f_c tanh(q'/v_s) - k q - s,  F = k q,  s = k2 (q - q2) + c2 (q' - q2'),  m2 q2'' = s
- * with i the command that is in force: of tick j from (j + late) T + delay on. */
+ * with i the command that is in force: of tick j from (j + late) T + delay on. With v_s = 0 the motor sticks: its friction
+ * is within f_c while q' is zero (theta method of Moreau and Jean; without a second part). */
 #include <math.h>
 #ifdef PLAN /* predictive control */
 #include "force_mpc.h"
@@ -37,6 +38,17 @@ static void rate(const machine *m, const double *x, double i, double *d)
     d[1] = (m->per_ampere * i - m->damping * x[1] - m->coulomb * tanh(x[1] / m->smoothing) - m->stiffness * x[0] - s) / m->mass;
     d[2] = x[3];
     d[3] = m->mass2 > 0 ? s / m->mass2 : 0.0;
+}
+
+#define THETA 0.55 /* weight of a step's end: at one half what sticks would not come to rest */
+
+static void stick(const machine *m, double *x, double i, double h)
+{
+    double reach = THETA * h, inertia = m->mass + reach * (m->damping + reach * m->stiffness);
+    double push = m->mass * x[1] + reach * (m->per_ampere * i - m->stiffness * x[0]), left = fabs(push) - reach * m->coulomb;
+    double mean = left > 0 ? copysign(left, push) / inertia : 0.0;
+    x[0] += h * mean;
+    x[1] = (mean - (1.0 - THETA) * x[1]) / THETA;
 }
 
 static void advance(const machine *m, double *x, double i, double h)
@@ -83,7 +95,7 @@ void run(const machine *m, long n, long steps, double period, const double *refe
             if (given > m->drive_limit) given = m->drive_limit;
             if (given < -m->drive_limit) given = -m->drive_limit;
             given += m->drive_drift * t * period;
-            advance(m, x, m->drive_sign * given, period / (double)steps);
+            (m->smoothing > 0 ? advance : stick)(m, x, m->drive_sign * given, period / (double)steps);
         }
     }
 }

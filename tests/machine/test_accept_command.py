@@ -276,6 +276,25 @@ def test_a_report_leaves_out_what_is_of_another_problem_or_certificate(planned):
     assert "Acceptance: the law makes" in run("report")[1]
 
 
+def test_a_stage_is_a_name_and_never_a_path(planned):
+    """The law of a folder beside the bring-up was taken, and the acceptance could not be read back."""
+    from typer.testing import CliRunner
+
+    def refuse(stage, remedy):
+        arguments = ["accept", here / "stand.toml", here / "good.csv", "--stage", stage, "-o", here / "out"]
+        with pytest.raises(so.SeaoptError, match=f"has no stage of this name; {remedy}"):
+            CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
+
+    here, _ = planned
+    shutil.copytree(here / "out" / "bringup" / "full", here / "out" / "x")
+    before = {*here.rglob("*")}
+    for stage in ("../x", "stage_1/../../x", "stage_1/", "./stage_1", "", ".", "..", "stage_9", here / "out" / "x"):
+        refuse(stage, "there are full, stage_1$")
+    shutil.rmtree(here / "out" / "bringup")
+    refuse("../x", "make it: seaopt bringup")
+    assert {*here.rglob("*")} < before
+
+
 @pytest.mark.parametrize(
     ("file", "change"),
     [

@@ -103,7 +103,7 @@ def test_a_schedule_is_brought_up_from_a_quarter_of_its_bandwidth_and_each_stage
     law = ScheduledController.from_dict(content, problem.design_plant, problem.values(problem.parameters))
     assert seaopt("accept", play("full_2", law, stiff, place=8e5)).exit_code == 0
     missing = seaopt("accept", first, "--stage", "stage_9")
-    assert missing.exit_code != 0 and "make it: seaopt bringup" in str(missing.exception)
+    assert missing.exit_code != 0 and "there are full_1, full_2, stage_1, stage_2" in str(missing.exception)
 
 
 @pytest.mark.slow
