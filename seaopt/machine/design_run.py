@@ -26,14 +26,17 @@ def run_design(
     seed: int = 0,
     noise_gain: float | Float[np.ndarray, " runs"] = 1.0,
     rate: float = 1.0,
+    sticks: bool = False,
 ) -> LoopRun:
     """Return the runs of a law, with its terms and without its guards, on its design plant with each of some values.
     `sensors`: the errors of what it reads, with noise of `seed` times `noise_gain`; without them it reads the true
-    outputs. `rate`: at which the same numbers are stepped, over that which they were made for.
+    outputs. `rate`: at which the same numbers are stepped, over that which they were made for. `sticks`: whether dry
+    friction jumps at rest, in place of its smoothed curve.
     """
     assert controller.design is not None
     seen, values = controller.see(controller.design[0]), [controller.delay(each) for each in sets]
     law = runnable(controller, gate=False, heat=False, outer=controller.outer is not None)
     slowed = replace(law, sample_time_s=law.sample_time_s / rate)
-    loop = build_loop(controller, seen, [seen.complete(each) for each in values], slowed, sensors=sensors or Sensors())
+    devices = {"sensors": sensors or Sensors(), "sticks": sticks}
+    loop = build_loop(controller, seen, [seen.complete(each) for each in values], slowed, **devices)
     return run_loop(loop, values, reference, rtol=RTOL, seed=seed, noise_gain=noise_gain)

@@ -64,20 +64,31 @@ def planned(request):
 
 
 def test_the_largest_of_current_and_torque_stay_below_what_is_expected_at_most(planned, compiler, tmp_path):
+    """Also of machines that stick, whose current was up to 30 % above it: one of six was above."""
     plan, values, ranges, name, noise, make = planned
     rng = np.random.default_rng(7)
-    drawn = [{each: rng.uniform(*ends) for each, ends in ranges.items()} for _ in range(MACHINES)]
+    drawn = [values.update(**{each: rng.uniform(*ends) for each, ends in ranges.items()}) for _ in range(MACHINES)]
+    ways = [[replace(make(each), **way) for each in drawn] for way in ({}, {"smoothing": 0.0})]
     for stage in plan.stages:
         bench, reference = Bench(compiler, tmp_path, stage.controller, stage.name), stage.excitation.reference
         logs = [
-            bench.log(make(values.update(**draw)), reference, noise=noise, seed=seed)
-            for seed, draw in enumerate(drawn, start=100)
+            [bench.log(machine, reference, noise=noise, seed=seed) for seed, machine in enumerate(way, start=100)]
+            for way in ways
         ]
         for signal in ("I", name):
-            peaks = np.array([np.max(np.abs(log[signal])) for log in logs])
+            peaks = np.array([[np.max(np.abs(log[signal])) for log in way] for way in logs])
             most = stage.excitation.peaks[signal]
-            assert np.mean(peaks <= most) >= 0.97, (stage.name, signal, most, np.sort(peaks)[-4:])
-            assert most <= 1.3 * np.median(peaks), (stage.name, signal, most, np.median(peaks))
+            said = (stage.name, signal, most, np.sort(peaks)[:, -4:])
+            assert np.all(np.mean(peaks <= most, axis=1) >= 0.97), said
+            assert most <= 1.2 * np.max(peaks), said
+
+
+@pytest.mark.parametrize("count", [20, 21])
+def test_as_many_as_said_stay_below_what_peaks_are_expected_at_most(count):
+    """Of largest values, whose distribution is Gumbel's."""
+    sets = np.random.default_rng(1).gumbel(size=(10000, 1, count))
+    below = np.mean([np.exp(-np.exp(-expected._bound_next(peaks))) for peaks in sets])
+    assert expected.KEPT - 0.001 < below < expected.KEPT + 0.002, below
 
 
 def test_draws_on_which_the_loop_runs_away_are_in_no_peak_and_no_band_and_are_said():

@@ -11,7 +11,7 @@ import numpy as np
 from seaopt.control import Controller, ForceMPC, ScheduledController
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.formatting import format_count, format_number, join_words
-from seaopt.machine.bringup.expected import Band, Expected, OuterExpected
+from seaopt.machine.bringup.expected import KEPT, Band, Expected, OuterExpected
 from seaopt.machine.bringup.plan import BringUp, Stage
 from seaopt.machine.response.verdicts import find_friction, has_dry_friction, list_limits
 from seaopt.reporting.figures.panel import BAND, BLUE, VERMILION, Panel, frequency_panel, to_decibel
@@ -52,6 +52,7 @@ STILL = (
     "the first that moves."
 )
 MOVED = "Its effort swings by {} at most, and dry friction holds {}: the motor moves."
+KEEPS = f"Of certified machines {100.0 * KEPT:.0f} % stay below each figure that is expected at most."
 UNDER = (
     "Under this reference the model has {}, simulated with its dry friction; with that seaopt accept compares the log."
 )
@@ -237,6 +238,7 @@ def _describe_stage(stage: Stage) -> Section:
         *_say_whether_it_moves(stage),
         *say_prediction(stage),
         *_explain_friction(controller),
+        KEEPS,
     ]
     return Section(
         title=f"Stage {stage.name}", part="stages", sentences=tuple(sentences), tables=(_tabulate_peaks(stage),)
@@ -260,6 +262,7 @@ def _describe_outer(stage: Stage, around: OuterExpected) -> Section:
         *_say_ran_away(around),
         *_say_whether_it_moves(around),
         *_explain_friction(controller),
+        KEEPS,
     )
     title = f"Stage {stage.name}, with the outer loop"
     return Section(title=title, part="stages", sentences=sentences, tables=(_tabulate_peaks(around),))

@@ -12,7 +12,7 @@ from seaopt.control import ForceMPC
 from seaopt.errors import FileError
 from seaopt.machine.acceptance import StageName, hash_source
 from seaopt.machine.bringup.excitation import Excitation, count_periods
-from seaopt.machine.bringup.expected import Band, Expected, OuterExpected, enclose_link
+from seaopt.machine.bringup.expected import KEPT, Band, Expected, OuterExpected, enclose_link
 from seaopt.machine.response.judged import Prediction
 from seaopt.machine.response.verdicts import Motion, list_limits
 from seaopt.machine.stepped import Source, stand
@@ -160,9 +160,10 @@ class StoredStage(_Played):
 class StoredPlan:
     """What bringup.json has."""
 
-    json_keys = ("met", Key(field="fit_met", name="fit_met", omit_none=True), "stages")
+    json_keys = ("met", Key(field="fit_met", name="fit_met", omit_none=True), "peaks_kept", "stages")
 
     met: bool
+    peaks_kept: float  # share of certified machines that stay below each of `peaks`
     fit_met: bool | None = None
     stages: Annotated[tuple[StoredStage, ...], Constraints(min_length=1)]
 
@@ -189,7 +190,8 @@ class BringUp(Result, Worded):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of bringup.json (schema seaopt/bringup/2)."""
-        stored = StoredPlan(met=self.met, fit_met=self.fit_met, stages=tuple(map(_describe, self.stages)))
+        stages = tuple(map(_describe, self.stages))
+        stored = StoredPlan(met=self.met, fit_met=self.fit_met, peaks_kept=KEPT, stages=stages)
         return {"schema": BRINGUP_SCHEMA} | to_content(stored)
 
     @classmethod
