@@ -53,6 +53,8 @@ NOT_TOLD = {
     "limit",
     "limit": "in too many periods the command is at its limit, so that the log tells neither whether the machine is "
     "another one nor what differs; record again at a smaller amplitude, or allow a larger limit",
+    "drift": "it may be the reading that drifts, or the sensor that it is compared with; record again with more "
+    "periods or a larger reference, beside which noise and friction of the command are less",
 }
 UNTOLD = {
     "short, gain": "a law whose {} is half as large",
@@ -220,13 +222,18 @@ def say_drift(drift: Drift, command: str) -> str:
     """Return by how much a reading drifts beside what, and what would tell which of both it is. `command`: its name."""
     size = f"{format_number(abs(drift.value), 3)}{unit_after(drift.unit)} in {format_number(drift.lasts_s, 3)} s"
     said = f"{drift.name} drifts by {size} beside {drift.beside}"
-    if drift.beside != command and not drift.of_reading:
+    if drift.beside != command and drift.of_reading is False:
         return (
             f"{drift.beside} drifts by {size} beside {drift.name}, which the command or another sensor goes with: the "
             f"zero of {drift.beside} moves, not that of {drift.name}; tare, and record again"
         )
-    if drift.beside != command:
+    if drift.beside != command and drift.of_reading is None:
         return f"{said}, while the reference repeats: the zero of one of both sensors moves; tare, and record again"
+    if drift.beside != command:
+        return (
+            f"{said}, which the command or another sensor does not go with, while the reference repeats: its zero "
+            "moves, and with it the true value; tare, and record again"
+        )
     if not drift.of_reading:
         return f"{said}, but not beside another sensor: the drive or a load on the motor drifts, not the reading"
     return (

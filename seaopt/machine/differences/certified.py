@@ -13,7 +13,8 @@ machine may be off by more than that. Nor does one many of whose periods had the
 comes right after such a period, in which the loop was open.
 
 A sensor is at its range where readings pile up at an edge of what was read while the command moves on. One that drifts
-is told by what else knows the force (`drift`): a machine whose reading may drift by more than the 2 % is none of those.
+is told by what else knows the force (`drift`): a machine whose reading may drift by more than the 2 % is none of those,
+and where another sensor may be what drifts in its place, the log does not tell.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ MOVES = 0.5  # of the rows in which a reading stays at an edge: the command is a
 EXPLAINED = 0.95  # of the difference, from which on one cause is what differs
 MOST_LIMITED = 0.25  # of the periods, that may have the command at its limit
 Values = Mapping[str, float]
-Untold = Literal["", "phases", "limit"]
+Untold = Literal["", "phases", "limit", "drift"]
 
 
 @record
@@ -63,7 +64,7 @@ class Differences:
     nearest_misfit: float | None
     prediction: Prediction | None = None  # with dry friction
     # Why the log tells neither whether the machine is inside nor what differs: too few sets of phases for dry friction,
-    # or too many periods in which the command is at its limit.
+    # too many periods in which the command is at its limit, or a drift that may be another sensor's.
     untold: Untold = ""
     drifts: tuple[Drift, ...] = ()  # of the reading that is regulated, beside what else knows the force
 
@@ -75,7 +76,8 @@ class Differences:
     @property
     def read_wrongly(self) -> bool:
         """Whether a sensor is what keeps the machine from being one of those: at its range, or drifting."""
-        return any(each.kind == "range" for each in self.found) or any(each.of_reading for each in self.drifts)
+        drifting = any(each.of_reading is not False for each in self.drifts)
+        return drifting or any(each.kind == "range" for each in self.found)
 
 
 def compare(
@@ -121,9 +123,12 @@ def compare(
     together = each_line and is_one_of(comparison, spread, [model, *drawn], 1.0 - confidence)
     beyond = together and bool(found) and _is_beyond(comparison, values, found[0], model, reach)
     drifts = find_drifts(controller, logs)
-    inside = together and not flat and not beyond and not any(each.of_reading for each in drifts)
+    alike = together and not flat and not beyond
+    whose = {each.of_reading for each in drifts} - {False}
+    inside = alike and not whose
     explained = bool(found) and found[0].explains >= EXPLAINED and (found[0].left or 0.0) <= WORTH
     untold = "" if inside or flat or explained else find_untold(controller, measured)
+    untold = "drift" if alike and whose == {None} else untold
     worst = int(np.argmax(share))
     return Differences(
         inside=inside,

@@ -15,7 +15,10 @@ std of a mean is there that of the noise within the periods, at their lowest lin
 the periods, which a zero that moves once leaves alone. Friction that holds a motor lets the command go to and fro
 without the force; beside it, a difference counts beyond that.
 
-What is sure, and more than a machine may be off by, is a drift: of the reading, where nothing surely goes with that.
+What is sure, and more than a machine may be off by, is a drift. Whose it is a third one tells, as the command of a
+reading and an encoder that drift apart: the share of that, by least squares over the means, that the reading has beside
+it. It is the reading's where that part of it is a drift itself, and surely not where it surely has not all of it; in
+between the log does not tell.
 """
 
 from __future__ import annotations
@@ -53,7 +56,8 @@ class Drift:
     high: float
     unit: str
     lasts_s: float  # in which it does
-    of_reading: bool  # whether the reading may be what drifts: neither another sensor nor the command goes with it
+    # Whether the reading may be what drifts; None where another sensor does or the reading, and the log does not tell.
+    of_reading: bool | None
 
 
 @record(eq=False)
@@ -91,31 +95,37 @@ def find_drifts(controller: Controller, logs: Sequence[Ticks]) -> tuple[Drift, .
     return tuple(each for ticks in logs for each in _judge(controller, ticks))
 
 
-def _judge(controller: Controller, ticks: Ticks) -> list[Drift]:
-    """Return the drifts in a log: beside the command, and beside each sensor that the model has it follow at rest."""
-    reading = ticks.measured[:, 0]
+def _judge(controller: Controller, ticks: Ticks) -> Iterator[Drift]:
+    """Yield the drifts in a log: beside the command, and beside each sensor that the model has it follow at rest."""
+    reading, command = ticks.measured[:, 0], controller.command.input
     tolerated = TOLERATED * float(np.nanmax(np.abs(reading)))
     period, starts = list_periods(ticks.reference)
-    found, agrees = list[tuple[str, Change]](), False
-    for beside, expected in _follow(controller, ticks):
-        friction = find_friction(controller) if beside == controller.command.input else 0.0
-        means = _average(ticks, reading - expected, period, starts)
-        groups = means.sets if friction else means.levels
+    apart = {beside: reading - expected for beside, expected in _follow(controller, ticks)}
+    held = {beside: HELD * find_friction(controller) if beside == command else 0.0 for beside in apart}
+
+    def attribute(beside: str, size: float) -> bool | None:
+        """Return whether the reading is what drifts by this size, as the others tell; it may be beside the command."""
+        told = list[bool | None]()
+        for other in apart.keys() - {beside}:
+            there = np.isfinite(apart[beside] + apart[other])
+            columns = (np.where(there, apart[each], np.nan) for each in (beside, other))
+            ours, others = (_average(ticks, column, period, starts) for column in columns)
+            told.append(_tell_reading(ours, others, held[other], size, tolerated))
+        sure = [each for each in told if each is not None]
+        return all(sure) if sure or beside == command else None
+
+    for beside, off in apart.items():
+        means = _average(ticks, off, period, starts)
+        groups = means.sets if held[beside] else means.levels
         line, jump = _fit_slope(means, groups), _find_jump(means, groups)
-        sure = [each for each, most in ((line, 0.0), (jump, HELD * friction)) if each.least > tolerated + most]
+        sure = [each for each, most in ((line, 0.0), (jump, held[beside])) if each.least > tolerated + most]
         if sure:
-            found.append((beside, max(sure, key=lambda each: each.least)))
-        elif means.levels.shape[1] == 1:  # between groups a jump is not told
-            whole = _find_jump(means, means.levels)
-            agrees = agrees or max(whole.least, whole.reach) <= tolerated
-    return [
-        Drift(
-            log=ticks.source, name=controller.signals[0], beside=beside, value=each.value,
-            low=each.value - each.reach, high=each.value + each.reach, unit=controller.command.reference_unit,
-            lasts_s=each.rows / ticks.rate_hz, of_reading=not agrees,
-        )
-        for beside, each in found
-    ]  # fmt: skip
+            each = max(sure, key=lambda each: each.least)
+            yield Drift(
+                log=ticks.source, name=controller.signals[0], beside=beside, value=each.value,
+                low=each.value - each.reach, high=each.value + each.reach, unit=controller.command.reference_unit,
+                lasts_s=each.rows / ticks.rate_hz, of_reading=attribute(beside, abs(each.value)),
+            )  # fmt: skip
 
 
 def _follow(controller: Controller, ticks: Ticks) -> Iterator[tuple[str, Float[np.ndarray, " n"]]]:
@@ -189,3 +199,37 @@ def _find_jump(means: Means, groups: Bool[np.ndarray, "p g"]) -> Change:
     reach = float(stdtrit(means.free, 1.0 - 0.5 * RISK / pairs)) * math.sqrt(2.0) * means.std
     rows = int(means.first[other] - means.first[one]) + means.period
     return Change(value=float(apart[one, other]), reach=reach, rows=rows)
+
+
+def _tell_reading(apart: Means, other: Means, held: float, size: float, tolerated: float) -> bool | None:
+    """Tell by what a reading is off beside another signal whether it is what drifts by a size. `held`: by how much
+    friction lets the other go to and fro.
+    """
+    low, high = _find_share(apart, other, held)
+    if low * size > tolerated:
+        return True
+    whole = _find_jump(other, other.levels)
+    still = other.levels.shape[1] == 1 and abs(whole.value) + whole.reach <= tolerated
+    return False if still or high < 1.0 else None
+
+
+def _find_share(apart: Means, other: Means, held: float) -> tuple[float, float]:
+    """Return the interval of the share of what a reading is off by beside one signal that it is off by beside another.
+    `held`: by how much friction lets the other go to and fro, beside which a line tells more.
+    """
+    from scipy.special import stdtrit  # deferred: 0.1 s
+
+    groups = other.sets if held else other.levels
+    at = groups / np.sum(groups, axis=0)
+    ours, theirs = (column - groups @ (at.T @ column) for column in (apart.mean, other.mean))
+    power, low, high = float(ours @ ours), -math.inf, math.inf
+    if power and other.free:
+        reach = float(stdtrit(other.free, 1.0 - 0.5 * RISK)) * other.std / math.sqrt(power)
+        reach += 0.5 * held * float(np.sum(np.abs(ours))) / power
+        share = float(ours @ theirs) / power
+        low, high = share - reach, share + reach
+    line, beside = _fit_slope(apart, groups), _fit_slope(other, groups)
+    if line.least > 0.0 and math.isfinite(beside.reach):
+        share, reach = beside.value / line.value, beside.reach / line.least
+        low, high = max(low, share - reach), min(high, share + reach)
+    return low, high

@@ -91,7 +91,7 @@ def judge(result: Acceptance, commands: Commands) -> Verdict | None:
         parts.append(say_inside(result, differences))
         first = response is not None and response.rate != 1.0  # by which all figures are other ones
         reasons += list_drifts(result, differences)[:1]
-        if differences.found or not (differences.read_wrongly and differences.each_line):
+        if differences.found or differences.untold or not (differences.read_wrongly and differences.each_line):
             said = say_untold(differences.untold) if differences.untold else _say_best(differences)
             reasons.insert(0 if first else len(reasons), Reason(what=said))
     reasons += undecided  # what differs may be why
@@ -163,7 +163,8 @@ def say_inside(result: Acceptance, differences: Differences) -> str:
 
 def list_drifts(result: Acceptance, differences: Differences) -> list[Reason]:
     """Return the drifts of readings, those that may be the readings' own and the largest first."""
-    ranked = sorted(differences.drifts, key=lambda each: (not each.of_reading, -abs(each.value)))
+    order = (True, None, False)
+    ranked = sorted(differences.drifts, key=lambda each: (order.index(each.of_reading), -abs(each.value)))
     command = result.controller.command.input
     return [Reason(what=say_drift(each, command), where=each.log) for each in ranked]
 
