@@ -17,7 +17,7 @@ without the force; beside it, a difference counts beyond that.
 
 What is sure, and more than a machine may be off by, is a drift. Whose it is a third one tells, as the command of a
 reading and an encoder that drift apart: the share of that, by least squares over the means, that the reading has beside
-it. It is the reading's where that part of it is a drift itself, and surely not where it surely has not all of it; in
+it. It is the reading's where that part of it is a drift itself, and surely not where it surely has not most of it; in
 between the log does not tell.
 """
 
@@ -41,6 +41,7 @@ SLOW = 1e-3, 1e-2  # Hz: where a static gain is the same at both
 RISK = 1e-4  # that noise is taken for a drift
 HELD = 4.0  # times the dry friction: the motor rests anywhere within twice that, and a machine may have twice as much
 SAME_LEVEL = 1e-3  # of the largest reference: means that are one
+SHOWN = 0.6  # of a drift of the reading, that any other shows of it: spring and efficiency may be 20 % off
 LINES = 5  # of a period, the lowest, whose noise is that of its mean
 
 
@@ -209,8 +210,8 @@ def _tell_reading(apart: Means, other: Means, held: float, size: float, tolerate
     if low * size > tolerated:
         return True
     whole = _find_jump(other, other.levels)
-    still = other.levels.shape[1] == 1 and abs(whole.value) + whole.reach <= tolerated
-    return False if still or high < 1.0 else None
+    still = other.levels.shape[1] == 1 and abs(whole.value) + whole.reach <= min(tolerated, SHOWN * size)
+    return False if still or high < SHOWN else None
 
 
 def _find_share(apart: Means, other: Means, held: float) -> tuple[float, float]:
