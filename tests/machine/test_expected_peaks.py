@@ -85,7 +85,7 @@ def test_the_largest_of_current_and_torque_stay_below_what_is_expected_at_most(p
             most = stage.excitation.peaks[signal]
             said = (stage.name, signal, most, np.sort(peaks)[:, -4:])
             assert np.all(np.mean(peaks <= most, axis=1) >= 0.97), said
-            assert most <= 1.2 * np.max(peaks), said
+            assert most <= 1.3 * np.max(np.median(peaks, axis=1)), said
 
 
 @pytest.mark.parametrize("count", [20, 21])
@@ -93,7 +93,7 @@ def test_as_many_as_said_stay_below_what_peaks_are_expected_at_most(count):
     """Of largest values, whose distribution is Gumbel's."""
     sets = np.random.default_rng(1).gumbel(size=(10000, 1, count))
     below = np.mean([np.exp(-np.exp(-expected._bound_next(peaks))) for peaks in sets])
-    assert expected.KEPT - 0.001 < below < expected.KEPT + 0.002, below
+    assert expected.KEPT < below < expected.KEPT + 0.01, below
 
 
 def test_draws_on_which_the_loop_runs_away_are_in_no_peak_and_no_band_and_are_said():
