@@ -559,8 +559,10 @@ def _run_tests(fit: Fit, minimum: Minimum, freed: Freed | None) -> dict[str, Sco
 
 
 def _list_rivals(causes: Sequence[Explanation]) -> list[Explanation]:
-    """Return the causes that explain the residuals as well as the best, up to three."""
-    return [cause for cause in causes if cause.gain > RIVAL_SHARE * causes[0].gain][:3]
+    """Return the causes that explain the residuals as well as the best, but not those that add to it, up to three."""
+    rivals = [cause for cause in causes if cause.gain > RIVAL_SHARE * causes[0].gain]
+    names = rivals[0].preferred.keys() if rivals else set[str]()
+    return [each for each in rivals if not (names and names < each.preferred.keys())][:3]
 
 
 def _name_causes(

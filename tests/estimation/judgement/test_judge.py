@@ -154,6 +154,33 @@ def test_a_chirp_that_ends_in_noise_is_no_changed_plant():
 
 
 @pytest.mark.usefixtures("without_hypotheses")
+def test_a_delay_beside_a_damper_of_none_is_no_other_cause():
+    """It was "a delay of 2 ms; or a delay of 2 ms, with c_s = 0 in place of 0, and the logs cannot separate them"."""
+    t, (inertia, damping, ratio, torque, stiffness) = np.arange(8000) / 1e3, (2e-5, 2e-4, 80.0, 0.1, 250.0)
+    current = np.sin(2 * np.pi * (0.2 * t + 1.8 * t**2))
+    a = np.array([[0.0, 1.0], [-stiffness / ratio**2 / inertia, -damping / inertia]])
+    system = (
+        a,
+        np.array([[0.0], [torque / inertia]]),
+        np.array([[stiffness / ratio, 0.0], [1.0, 0.0]]),
+        np.zeros((2, 1)),
+    )
+    a, b, c, d, _ = signal.cont2discrete(system, 1e-3)
+    y = signal.dlsim((a, b, c, d, 1e-3), np.r_[0.0, 0.0, current[:-2]])[1]
+    noisy = y + np.random.default_rng(1).normal(size=y.shape) * [0.05, 4e-4]
+    plant = so.plants.rotary(link="locked")
+    log = so.Log.from_arrays(time=t, I=current, tau_s=noisy[:, 0], theta_m=noisy[:, 1])
+    values = plant.defaults.update(J_m=inertia, b_r=damping, N=ratio, K_tau=torque, k_s=stiffness, c_s=0.0, f_c=0.0)
+    experiment = so.Experiment(plant=plant, log=log, outputs=("tau_s", "theta_m"))
+    (cause,) = (
+        each
+        for each in so.fit([experiment], values.free("J_m", "b_r", "K_tau", "k_s")).findings
+        if each.kind == "cause"
+    )
+    assert "a delay of 2 ms" in cause.text and "c_s" not in cause.text
+
+
+@pytest.mark.usefixtures("without_hypotheses")
 def test_clipping_ahead_of_the_noise_is_found():
     columns, rng = bench(noise_n=0.0), np.random.default_rng(5)
     level = 1.5 * np.std(columns["F1"])
