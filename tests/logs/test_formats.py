@@ -5,8 +5,11 @@ from __future__ import annotations
 import builtins
 import gc
 import json
+import logging
 import struct
 import sys
+import threading
+import warnings
 import zipfile
 import zlib
 
@@ -414,6 +417,27 @@ def test_a_library_that_does_not_fit_into_memory_is_no_damaged_file(tmp_path):
 
     with pytest.raises(LogError, match=r"cannot be loaded.*ulimit"), translate_errors(tmp_path / "log.csv", "CSV"):
         raise NameError("name 'PyLazyFrame' is not defined")
+
+
+def test_readers_in_threads_leave_warnings_and_logs_of_a_process_as_they_were(tmp_path):
+    """The second begins while the first reads, and ends after it."""
+    from seaopt.logs.formats.source import translate_errors
+
+    found = logging.root.manager.disable, list(warnings.filters)
+    begun, over = threading.Event(), threading.Event()
+
+    def read():
+        with translate_errors(tmp_path / "log.csv", "CSV"):
+            begun.set()
+            assert over.wait(60.0)
+
+    second = threading.Thread(target=read)
+    with translate_errors(tmp_path / "log.csv", "CSV"):
+        second.start()
+        assert begun.wait(60.0)
+    over.set()
+    second.join()
+    assert (logging.root.manager.disable, list(warnings.filters)) == found
 
 
 def test_an_mcap_topic_of_two_types_is_refused(tmp_path):

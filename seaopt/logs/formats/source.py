@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
+import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import field, replace
 from importlib import import_module
 from itertools import islice
@@ -189,14 +190,38 @@ def spread(
     return parts
 
 
+class _Silence:
+    """No warnings and logs of a process while any of its threads reads; both as they were after the last. (Were each
+    thread to put back what it found, one that begins while another reads would leave them off for good.)
+    """
+
+    def __init__(self) -> None:
+        self.lock, self.readers, self.undo = threading.RLock(), 0, ExitStack()
+
+    def __enter__(self) -> None:
+        with self.lock:
+            self.readers += 1
+            if self.readers == 1:
+                self.undo.callback(logging.disable, logging.root.manager.disable)
+                self.undo.enter_context(warnings.catch_warnings())
+                logging.disable(logging.CRITICAL)
+                warnings.simplefilter("ignore")
+
+    def __exit__(self, *_: object) -> None:
+        with self.lock:
+            self.readers -= 1
+            if not self.readers:
+                self.undo.close()
+
+
+_SILENCE = _Silence()
+
+
 @contextmanager
 def translate_errors(path: Path, form: str) -> Generator[None]:
     """Turn whatever a library raises on a damaged file into a LogError of one line; its warnings and logs are muted."""
-    silenced = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with _SILENCE:
             yield
     except SeaoptError:
         raise
@@ -219,8 +244,6 @@ def translate_errors(path: Path, form: str) -> Generator[None]:
             f"{path}: cannot be read as {form} ({summarise_error(error)}); the file may be cut off or damaged, "
             "copy or record it again"
         ) from error
-    finally:
-        logging.disable(silenced)
 
 
 def summarise_error(error: BaseException) -> str:
@@ -232,8 +255,7 @@ def summarise_error(error: BaseException) -> str:
 def import_optional(module: str, extra: str, path: Path, form: str) -> Any:
     """Import an optional library. Raises LogError: it is not installed; the message names the extra."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with _SILENCE:
             return import_module(module)
     except ImportError as error:
         raise LogError(f"{path}: reading {form} needs an extra library; pip install 'seaopt[{extra}]'") from error
