@@ -323,7 +323,7 @@ def fit(
         ),
     ] = False,
     no_causes: Annotated[
-        bool, typer.Option("--no-causes", help="Do not look for what the model may lack, as causes = false in [fit].")
+        bool, typer.Option("--no-causes", help="Do not look for what the model may lack, as the key causes = false.")
     ] = False,
 ) -> None:
     """Fit the parameters to the logs; write fit.json."""
