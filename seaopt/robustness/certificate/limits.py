@@ -47,6 +47,7 @@ from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_b
 from seaopt.robustness.verification.scenarios import STEP_SHARES
 
 PASSIVE = "passive_band_hz"
+ANY_MS = 1e6  # of a law that no sensitivity is asked of: what is above is unstable
 WITH_TERMS = (
     "margins, worst cases and draws of every plant are of the loop with the outer loop around it, with what is "
     "compensated of its weight and, where it sticks, with friction's compensation from the speed; what is asked of the "
@@ -144,8 +145,9 @@ def _find_law(
 def judge_logs(context: CheckContext, _: Progress) -> Evidence:
     """Judge the law on every log of the fit that is of one of its plants, and was taken where a schedule stands."""
     controller, fit = context.cases.controller, context.source
-    limit = controller.spec.level("max_sensitivity")
-    if limit is None or not isinstance(fit, Fit):
+    asked = controller.spec.level("max_sensitivity")
+    limit = ANY_MS if asked is None else asked
+    if not isinstance(fit, Fit):
         return Evidence()
     names = {plant.name for plant in context.cases.models.values()}
     logs = [each for each in (*fit.experiments, *fit.validation) if each.plant.name in names]
@@ -154,6 +156,7 @@ def judge_logs(context: CheckContext, _: Progress) -> Evidence:
     judged = [judge_log(controller, fit, experiment, limit) for experiment in logs]
     verdicts = tuple(verdict for of_log, _ in judged for verdict in of_log)
     rows = [row for each in verdicts for row in _list_log_rows(each, limit * (1.0 + GRACE))]
+    rows = [row for row in rows if asked is not None or row.name != LOG_SENSITIVITY or not row.met]
     remarks = [SILENT[silent.why].format(silent) for _, silent in judged if silent is not None]
     if fit.experiments and not logs and context.place is None:
         remarks.append(NO_LOG)

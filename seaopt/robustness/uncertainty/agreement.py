@@ -69,7 +69,8 @@ def judge_agreement(
     from scipy.special import fdtri  # deferred: 0.1 s
 
     away = np.abs(1.0 + loop)
-    left = np.maximum(np.abs(error) - unseen - GRACE * away, 0.0) / std
+    beyond = np.maximum(np.abs(error) - unseen - GRACE * away, 0.0)
+    left = np.divide(beyond, std, out=np.zeros_like(beyond), where=beyond > 0.0)
     at, pairs = int(np.argmax(left)), 2.0 * error.size / ALIKE
     z = _split(left * np.exp(1j * np.angle(error)))
     misfit, allowed = float(z @ z) / pairs, float(fdtri(pairs, pairs * freedom, 1.0 - 0.5 * alpha))
@@ -103,6 +104,7 @@ def _explain(z: Float[np.ndarray, " n"], moves: Float[np.ndarray, "k n"], alpha:
     """Return how much of the square of z some parameters take off that lie within their intervals but for a risk."""
     from scipy.optimize import brentq  # deferred: 0.2 s
 
+    moves = moves[np.any(moves != 0.0, axis=1)]
     if not len(moves):
         return 0.0
     values, vectors = np.linalg.eigh(moves @ moves.T)

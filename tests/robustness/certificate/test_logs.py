@@ -336,9 +336,11 @@ def test_of_logs_with_lagged_noise_hardly_one_has_a_line_outside_its_disc():
 def judge_slow(stand, thor):
     """Certify a law of 4 Hz, whose Ms hardly feels by what another actuator is off, on a fit with its intervals."""
     start = thor.update(J=3e-6).free("J", "b_r", "eta")
-    spec = so.ControllerSpec(bandwidth_hz=4, bandwidth_range_hz=(1, 60), max_sensitivity=1.9, max_noise_gain=1.0)
 
-    def judge(fitted=(), validate=()):
+    def judge(fitted=(), validate=(), max_sensitivity=1.9):
+        spec = so.ControllerSpec(
+            bandwidth_hz=4, bandwidth_range_hz=(1, 60), max_sensitivity=max_sensitivity, max_noise_gain=1.0
+        )
         logs = {"chirp": {}} | {f"fitted{k}": each for k, each in enumerate(fitted)}
         others = {f"other{k}": each for k, each in enumerate(validate)}
         experiments, validation = (
@@ -368,6 +370,13 @@ def test_fitted_log_of_another_actuator_fails_by_name_too(judge_slow):
     rows = rows_of(judge_slow(fitted=[{"seed": 2, "gain": 0.5}]), LOG_AGREEMENT)
     assert {row.plant for row in rows if not row.met} == {"log:chirp"}  # the fit is of the other one
     assert all(row.risk is None for row in rows)
+
+
+def test_log_of_another_actuator_fails_by_name_where_no_sensitivity_is_asked(judge_slow):
+    certificate = judge_slow(validate=[{"seed": 2, "gain": 0.5}], max_sensitivity=False)
+    rows = rows_of(certificate, LOG_AGREEMENT)
+    assert [(row.plant, row.met) for row in rows] == [("log:chirp", True), ("log:other0", False)]
+    assert rows_of(certificate) == [] and not certificate.met
 
 
 def test_right_log_and_one_that_is_off_by_less_than_the_grace_agree_and_risks_add_up(judge_slow):
@@ -410,6 +419,7 @@ def test_of_right_logs_hardly_one_contradicts_what_the_fit_knows(std):
 def test_gain_beyond_its_interval_contradicts(off):
     assert all(contradicts(seed, off, 0.01) for seed in range(20))
     assert not any(contradicts(seed, off, 0.5) for seed in range(20))
+    assert contradicts(0, off, 0.0)  # no parameter of the fit moves this log
 
 
 def test_error_of_the_model_widens_up_to_what_a_met_fit_may_leave():
