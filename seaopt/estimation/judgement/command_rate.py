@@ -10,8 +10,9 @@ with a free shift of its rows, the logs have to be nearer to the interpolated on
 nearer the rate is named beside the other causes, and where the shift is it is not.
 
 A delay that is free makes up for it so well that there is hardly an excess: with twice the values a row it is a quarter
-of a row longer. One step from the minimum tells whether the logs speak against that. Where they do not the intervals
-reach to the values with that, and where they speak for it the rate is named.
+of a row longer. One step from the minimum tells whether the logs speak against that. Where they do not, the delay is
+named as what such a log does not tell; where they speak for it the rate is, and the intervals reach to the values with
+it.
 
 Of one that changes from tick to tick, as binary noise, the rows tell nothing about what lies between them. With
 the spectrum F of what is white in the rows, and S of all of them, the outputs follow the rows at a frequency only to
@@ -179,13 +180,12 @@ def _weigh_rates(fit: Fit, minimum: Minimum) -> UnloggedCommand | None:
             break
     if not np.isfinite(nearer):
         return None
-    values = problem.unknowns.by_name(best.z)
     if nearer < enough:
         findings = tuple(_state_open(e.data, found) for e in problem.experiments)
-    else:
-        seen = f"with the values between interpolated the logs are e^{nearer:.3g} times as likely, and the delay longer"
-        findings = tuple(_state(e.data, found, seen, READING, certain=False) for e in problem.experiments)
-    return UnloggedCommand(findings=findings, standing="possible", values=values)
+        return UnloggedCommand(findings=findings, standing="possible")
+    seen = f"with the values between interpolated the logs are e^{nearer:.3g} times as likely, and the delay longer"
+    findings = tuple(_state(e.data, found, seen, READING, certain=False) for e in problem.experiments)
+    return UnloggedCommand(findings=findings, standing="possible", values=problem.unknowns.by_name(best.z))
 
 
 def _refit_late(problem: FitProblem, z: Vector, count: int) -> Evaluation:
@@ -300,6 +300,7 @@ def _state_open(experiment: Experiment, count: int) -> FitFinding:
         kind="command",
         where=experiment.name,
         text=f"the log does not tell whether the command was held at its rate of {1.0 / period:.4g} Hz or at a faster "
-        f"one: at {count * 1.0 / period:.4g} Hz the delay would be {500.0 * (1.0 - 1.0 / count) * period:.3g} ms "
-        "longer, which its interval allows for; one with more at high frequencies would tell",
+        f"one: at {count / period:.4g} Hz the delay would be {500.0 * (1.0 - 1.0 / count) * period:.3g} ms "
+        "longer, which its interval does not allow for; one with more at high frequencies would tell",
+        rate_hz=count / period,
     )

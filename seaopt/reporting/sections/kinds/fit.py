@@ -103,6 +103,8 @@ def _repeats(fit: Fit) -> bool:
 def _name_silent(fit: Fit) -> str:
     """Return what the logs cannot tell, for the verdict; "" where there is nothing."""
     ties = [f"{join_words(list(each.shifts))} where {each.effect}" for each in fit.silent]
+    rates = (each for each in fit.findings if each.kind == "command" and each.severity == "note")
+    ties += [f"{each.where}.delay_s where the command was held at {each.rate_hz:.4g} Hz" for each in rates]
     return f"; cannot be told from such a log: {'; '.join(ties)}" if ties else ""
 
 
