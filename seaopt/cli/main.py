@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from seaopt.cli.terminal import Amount, add_remedy, end, leave_pipe, list_notes, prepare_streams
-from seaopt.errors import ControlError, InternalError, ProblemError, SeaoptError
+from seaopt.errors import ControlError, InternalError, SeaoptError
 from seaopt.formatting import printable
 
 if TYPE_CHECKING:
@@ -329,8 +329,6 @@ def fit(
     """Fit the parameters to the logs; write fit.json."""
     from seaopt.cli.session import Session
 
-    if explain and no_causes:
-        raise ProblemError("--explain looks for what the model lacks; leave --no-causes out")
     session = Session(problem, output, design=False, explain=explain, causes=not no_causes)
     _run_stage(session, "fit", json, quiet, verbose)
 

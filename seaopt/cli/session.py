@@ -339,6 +339,8 @@ class Session:
         self.results["simulate"] = runs
 
     def _fit(self, tell: Progress) -> None:
+        if self.explain and not (self.causes and self.problem.fit_options["causes"]):
+            raise ProblemError("--explain looks for what the model lacks; leave out --no-causes, and causes = false")
         reading, fitting, again = divide(tell, READING, 1.0 - READING, 1.0 if self.explain else 0.0)
         reading("reading logs", 0.0)
         experiments, start = self.experiments(), self._find_earlier_fit()

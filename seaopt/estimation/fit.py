@@ -87,7 +87,7 @@ def fit(
         outputs' figures are missing, and the fit is not judged.
     causes : bool
         False leaves out the search for what the model lacks, which takes most of the time of a fit that leaves
-        something; the fit's findings say so.
+        something; the fit's findings say so, and it is not met where it leaves what asks for the search.
     alternatives : sequence of Plant
         Other plants that may have been on the bench: where a log is not explained, they are tried.
     validation : sequence of Experiment

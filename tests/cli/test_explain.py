@@ -86,7 +86,10 @@ def test_a_fit_may_leave_the_search_for_causes_out(problem, seaopt):
     assert "unsearched" in kinds and "excess" in kinds and not kinds & {"cause", "fixed", "budget"}
 
     refused = seaopt("fit", problem, "-o", out, "--no-causes", "--explain")
-    assert refused.returncode == 2 and "leave --no-causes out" in refused.stderr
+    assert refused.returncode == 2 and "leave out --no-causes" in refused.stderr
+    problem.write_text(problem.read_text(encoding="utf-8") + "[fit]\ncauses = false\n", encoding="utf-8")
+    refused = seaopt("fit", problem, "-o", out, "--explain")
+    assert refused.returncode == 2 and "causes = false" in refused.stderr
 
 
 def test_a_file_may_leave_the_search_for_causes_out(problem):

@@ -357,3 +357,9 @@ def _flatten(experiment: Experiment) -> Experiment:
                 flat[np.concatenate(rest)] = np.mean(column[np.concatenate(rest)])
         values[name] = flat
     return replace(experiment, log=log.with_values(log.time, values, "inputs at rest are constant"))
+
+
+def leaves_something(fit: Fit, findings: Sequence[FitFinding], error: ModelError, most: float) -> bool:
+    """Tell whether a fit leaves something to look into, as an excess above `most`."""
+    warned = any(finding.severity != "note" for finding in findings)
+    return warned or fit.status != "converged" or any(ratio > most for ratio in error.excess.values())

@@ -23,7 +23,7 @@ from seaopt.estimation.judgement.another_start import find_other_minimum
 from seaopt.estimation.judgement.causes import Explanation, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.command_rate import find_unlogged_command
-from seaopt.estimation.judgement.hypothesis_search import REMOVED, TriedHypotheses, search_hypotheses
+from seaopt.estimation.judgement.hypothesis_search import ASKS, REMOVED, TriedHypotheses, search_hypotheses
 from seaopt.estimation.judgement.intervals import (
     find_excesses,
     find_rough,
@@ -32,6 +32,7 @@ from seaopt.estimation.judgement.intervals import (
     find_step_error,
     find_wrong_starts,
     free_starts,
+    leaves_something,
 )
 from seaopt.estimation.judgement.score_test import Freed, ScoreTest, free_fixed, run_score_tests
 from seaopt.estimation.judgement.second_log import FAR, compare_logs, has_two_amplitudes
@@ -148,11 +149,13 @@ def judge(
         *another,
     ]
     commanded = () if command is None else command.findings
+    tests = {} if standing == "certain" else _run_tests(fit, minimum, freed)
+    suspects = {name: test for name, test in tests.items() if test.p < DOUBTFUL}
     if standing == "certain" or not causes:
-        unsearched = () if causes else (find_unsearched(),)
-        every = [*findings, *commanded, *unsearched, *find_step_error(fit)]
-        return _conclude(replace(fit, findings=order_findings(every)))
-    suspects = {name: test for name, test in _run_tests(fit, minimum, freed).items() if test.p < DOUBTFUL}
+        asks = suspects or leaves_something(fit, findings, error, ASKS) or _hangs_on_little(fit, findings)
+        unsearched = () if causes else (find_unsearched(asked=bool(asks)),)
+        found = order_findings([*findings, *commanded, *unsearched, *find_step_error(fit)])
+        return _conclude(replace(fit, findings=found))
     if standing == "likely":
         evaluations = EVALUATIONS  # what brings a random force is hardly among the causes
     budget = EvaluationBudget.begin((OF_HYPOTHESES + OF_CAUSES) * evaluations, minimum.problem.count_work(minimum.z))
@@ -188,11 +191,7 @@ def _search_causes(
     if wrong:
         found, trials = _judge_with_free_starts(fit, wrong, alternatives, budget, progress)
         return fit, [*findings, *found], TriedHypotheses(trials=trials)
-    noticed = (
-        any(ratio > FAR for ratio in error.excess.values())  # noise of a colour is so, too
-        or any(finding.severity != "note" for finding in findings)
-        or fit.status != "converged"
-    )
+    noticed = leaves_something(fit, findings, error, FAR)  # noise of a colour is so, too
     little = any(finding.kind == "explained" for finding in findings)
     doubtful = _hangs_on_little(fit, findings)
     looking = budget.part(OF_HYPOTHESES * evaluations)

@@ -107,14 +107,19 @@ def find_unjudged() -> FitFinding:
     )
 
 
-def find_unsearched() -> FitFinding:
-    """Return a note that nobody has looked for what the model lacks."""
+def find_unsearched(*, asked: bool) -> FitFinding:
+    """Return a note that nobody has looked for what the model lacks; an error where the fit left what `asked` for it,
+    as intervals then lack the values that another cause would give.
+    """
+    left_out = "what the model may lack was not looked for, as causes = false leaves that out"
     return FitFinding(
-        severity="note",
+        severity="error" if asked else "note",
         kind="unsearched",
         where="",
-        text="what the model may lack was not looked for, as causes = false leaves that out: no cause is named, and "
-        "intervals do not reach to values that another cause would give",
+        text=f"{left_out}, and what the fit leaves asks for it: values may be off by more than their intervals; fit "
+        "with causes = true"
+        if asked
+        else f"{left_out}; nothing that the fit leaves asks for it",
     )
 
 
