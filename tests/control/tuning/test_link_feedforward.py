@@ -155,13 +155,38 @@ def test_a_plant_that_loses_band_is_named_beside_one_that_wins():
     assert nothing.endswith("without it from 16 to 36 Hz: no more of the band, so leave link_feedforward out")
 
 
+SAME, NOWHERE = ((12.0, 36.0), (12.0, 36.0)), (None, None)
+HARDLY_MORE, HARDLY_LESS = ((12.0, 36.00000001), (12.0, 36.0)), ((12.00000001, 36.0), (12.0, 36.0))
+MORE = ((11.8, 36.0), (12.0, 36.0))  # 0.024 octaves
+
+
+@pytest.mark.parametrize(
+    ("cost", "bands", "leave"),
+    [
+        (-0.05, [SAME], False),
+        (-0.12, [NOWHERE], False),
+        (1e-12, [SAME], False),
+        (0.05, [SAME], True),
+        (0.12, [NOWHERE], True),
+        (0.14, [HARDLY_MORE], True),
+        (0.14, [SAME, HARDLY_LESS], True),
+        (0.14, [SAME, MORE], False),
+    ],
+)
+def test_it_is_said_to_be_left_out_where_it_costs_and_wins_nothing(cost, bands, leave):
+    followed = [FollowedBand(plant=f"arm {i}", band_hz=band, without_hz=bare) for i, (band, bare) in enumerate(bands)]
+    said = LinkEffect(objective="disturbance", cost=cost, bands=tuple(followed)).describe()
+    assert said.endswith("no more of the band, so leave link_feedforward out") == leave
+    assert "arm 0" in said and "arm 1" not in said
+
+
 def test_a_path_that_wins_no_band_is_said_to_be_left_out(stand, swing, thor):
     """A lag of 2 Hz leaves of the path what is of no use to 30 Hz: by hand the swing follows less of the band."""
     asked = LinkFeedforward(fraction=0.3, corner_hz=2.0, high_pass_hz=0.2)
     law = so.tune(stand, thor, replace(SPEC, link_feedforward=asked), {"swing": swing})
     bare = so.tune(stand, thor, SPEC, {"swing": swing})
     assert np.divide(*weigh_by_hand(law)[0]) > np.divide(*weigh_by_hand(bare)[0])
-    assert law.met and law.link.effect.bands[0].octaves_won < 0.0
+    assert law.met and law.link.effect.cost > 0.0 and law.link.effect.bands[0].octaves_won < 0.0
     assert any(note.endswith("no more of the band, so leave link_feedforward out") for note in law.notes)
 
 

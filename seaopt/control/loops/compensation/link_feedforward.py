@@ -71,6 +71,8 @@ LARGEST_MISFIT = 0.2  # of the effort, between a tenth of the bandwidth and it
 FRACTIONS = np.round(np.linspace(0.0, 1.0, 101), 2)
 ROOM = 0.95  # of Ms, that the path alone may use
 OTHER_STATES = 1e-9  # of a signal's slopes: less is rounding
+LEAST_COST = 1e-3  # share of the objective: less is the search's
+LEAST_OCTAVES = 0.01  # of a band won or lost: less is none
 
 
 @record
@@ -145,10 +147,10 @@ class LinkEffect:
             return text
         first, least = self.bands[0], min(self.bands, key=lambda band: band.octaves_won)
         text += f", and {first.describe()}"
-        if least is not first and least.octaves_won < 0.0:
+        if least is not first and least.octaves_won < -LEAST_OCTAVES:
             text += f"; {least.describe()}"
-        won = any(band.octaves_won > 0.0 for band in self.bands)
-        return text if won else f"{text}: no more of the band, so leave link_feedforward out"
+        worth = self.cost < LEAST_COST or any(band.octaves_won > LEAST_OCTAVES for band in self.bands)
+        return text if worth else f"{text}: no more of the band, so leave link_feedforward out"
 
 
 def _count_octaves(band_hz: tuple[float, float] | None) -> float:
