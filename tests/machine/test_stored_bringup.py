@@ -31,6 +31,14 @@ def content(plan):
     return json.loads(to_json(seal(plan.to_dict())))
 
 
+def test_a_bring_up_of_before_has_no_share_of_machines(content, laws):
+    old = json.loads(
+        to_json(seal({key: each for key, each in content.items() if key not in ("peaks_kept", "made_from")}))
+    )
+    assert content["peaks_kept"] == 0.98 and list_stages(old) == list_stages(content)
+    assert "peaks_kept" not in BringUp.from_dict(old, laws).to_dict()
+
+
 def test_a_bring_up_is_read_back(plan, laws, tmp_path, monkeypatch):
     path = write_json(tmp_path / "bringup.json", plan.to_dict())
     for module in ("certify", "expect", "tune_certified"):

@@ -160,11 +160,11 @@ class StoredStage(_Played):
 class StoredPlan:
     """What bringup.json has."""
 
-    json_keys = ("met", Key(field="fit_met", name="fit_met", omit_none=True), "peaks_kept", "stages")
+    json_keys = ("met", *(Key(field=name, name=name, omit_none=True) for name in ("fit_met", "peaks_kept")), "stages")
 
     met: bool
-    peaks_kept: float  # share of certified machines that stay below each of `peaks`
     fit_met: bool | None = None
+    peaks_kept: float | None = None  # share of certified machines that stay below each of `peaks`; None in older files
     stages: Annotated[tuple[StoredStage, ...], Constraints(min_length=1)]
 
 
@@ -178,10 +178,13 @@ class BringUp(Result, Worded):
         In the order in which they are played.
     fit_met : bool or None
         Whether the fit that the laws were tuned with is met; None where nothing is known of one.
+    peaks_kept : float or None
+        The share of certified machines that stay below each of the peaks; None as read from a file of before.
     """
 
     stages: tuple[Stage, ...]
     fit_met: bool | None = None
+    peaks_kept: float | None = KEPT
 
     @property
     def met(self) -> bool:
@@ -191,7 +194,7 @@ class BringUp(Result, Worded):
     def to_dict(self) -> dict[str, Any]:
         """Return the content of bringup.json (schema seaopt/bringup/2)."""
         stages = tuple(map(_describe, self.stages))
-        stored = StoredPlan(met=self.met, fit_met=self.fit_met, peaks_kept=KEPT, stages=stages)
+        stored = StoredPlan(met=self.met, fit_met=self.fit_met, peaks_kept=self.peaks_kept, stages=stages)
         return {"schema": BRINGUP_SCHEMA} | to_content(stored)
 
     @classmethod
@@ -204,7 +207,7 @@ class BringUp(Result, Worded):
         """
         stored = from_content(StoredPlan, content, FILE, remedy=PLAN_AGAIN)
         stages = tuple(_make_stage(each, laws, link) for each in stored.stages)
-        plan = cls(stages=stages, fit_met=stored.fit_met)
+        plan = cls(stages=stages, fit_met=stored.fit_met, peaks_kept=stored.peaks_kept)
         check_agrees(content, plan.to_dict(), FILE, remedy=PLAN_AGAIN)
         return plan
 
