@@ -53,8 +53,9 @@ NOT_TOLD = {
     "limit",
     "limit": "in too many periods the command is at its limit, so that the log tells neither whether the machine is "
     "another one nor what differs; record again at a smaller amplitude, or allow a larger limit",
-    "drift": "it may be the reading that drifts, or the sensor that it is compared with; record again with more "
-    "periods or a larger reference, beside which noise and friction of the command are less",
+    "drift": "it may be the reading that drifts, or what it is compared with; log another sensor that knows the force, "
+    "or where the command is compared, record again with more periods or a larger reference, beside which noise and "
+    "friction are less",
 }
 UNTOLD = {
     "short, gain": "a law whose {} is half as large",
@@ -234,11 +235,14 @@ def say_drift(drift: Drift, command: str) -> str:
             f"{said}, which the command or another sensor does not go with, while the reference repeats: its zero "
             "moves, and with it the true value; tare, and record again"
         )
+    if drift.of_reading is None:
+        return f"{said}, and the other sensors do not agree on whether it is the reading's; tare, and record again"
     if not drift.of_reading:
         return f"{said}, but not beside another sensor: the drive or a load on the motor drifts, not the reading"
     return (
         f"{said}, while the reference repeats: the sensor's zero moves, and with it the true value, or else the drive "
-        "or a load on the motor does; an encoder of the deflection in the log would tell which; tare, and record again"
+        "or a load on the motor does; an encoder of the deflection in the log, with less noise than that, would tell "
+        "which; tare, and record again"
     )
 
 

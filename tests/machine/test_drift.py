@@ -142,6 +142,17 @@ def test_an_encoder_or_a_reading_that_the_log_does_not_tell_apart_is_undecided(c
     assert Acceptance.from_dict(content, controller).differences.drifts == (drift,)
 
 
+@pytest.mark.parametrize("rate", [2.0, 3.0])
+def test_a_reading_with_which_neither_encoder_nor_command_goes_is_not_cleared(controller, bench, rate):
+    """Both drift, the encoder faster, so that it is off beside the reading in one direction and the command in the
+    other.
+    """
+    log = bench.log(RIGHT, REFERENCE, noise=0.2, drift=1.0)
+    result = so.accept(controller, [with_encoder(log, log["F1"] + (rate - 1.0) * log.time)])
+    assert not result.met and not result.differences.inside
+    assert True in {each.of_reading for each in result.differences.drifts}
+
+
 def test_a_drive_that_drifts_leaves_a_reading_that_an_encoder_goes_with(controller, bench):
     """Without the encoder nothing tells which of both it is."""
     machine = replace(RIGHT, drive_drift=0.01)

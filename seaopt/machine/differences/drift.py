@@ -112,8 +112,8 @@ def _judge(controller: Controller, ticks: Ticks) -> Iterator[Drift]:
             columns = (np.where(there, apart[each], np.nan) for each in (beside, other))
             ours, others = (_average(ticks, column, period, starts) for column in columns)
             told.append(_tell_reading(ours, others, held[other], size, tolerated))
-        sure = [each for each in told if each is not None]
-        return all(sure) if sure or beside == command else None
+        sure = {each for each in told if each is not None}
+        return None if len(sure) > 1 else sure.pop() if sure else True if beside == command else None
 
     for beside, off in apart.items():
         means = _average(ticks, off, period, starts)
@@ -211,7 +211,7 @@ def _tell_reading(apart: Means, other: Means, held: float, size: float, tolerate
         return True
     whole = _find_jump(other, other.levels)
     still = other.levels.shape[1] == 1 and abs(whole.value) + whole.reach <= min(tolerated, SHOWN * size)
-    return False if still or high < SHOWN else None
+    return False if still or -SHOWN < low <= high < SHOWN else None
 
 
 def _find_share(apart: Means, other: Means, held: float) -> tuple[float, float]:
