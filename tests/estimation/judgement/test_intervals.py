@@ -17,6 +17,7 @@ from seaopt.estimation.result.model_error import ModelError
 from seaopt.estimation.result.widening import widen
 from seaopt.files import to_json
 from seaopt.parameters import QUANTILE
+from tests.robustness.certificate.test_logs import record as record_stand
 
 N, PERIOD = 8000, 1e-3
 GAIN = so.Plant(
@@ -270,6 +271,16 @@ def test_a_component_of_cogging_is_known_over_the_size_of_both(half, severity):
     wide = np.diag(np.square([std * (name == "b_g") for name in names]))
     found = list(find_rough(widen(fit, wide), matters))
     assert [(each.kind, each.where) for each in found] == ([(severity, "b_g")] if severity else [])
+
+
+@pytest.mark.parametrize("late", [0, 2])
+def test_a_fit_without_the_search_is_not_met_where_something_asks_for_it(thor, late):
+    """A log 2 ms late moves J by 8 %, outside its interval, with a residual of 1.3 times the noise."""
+    log = record_stand(thor, amplitude=0.4, late=late)
+    experiment = so.Experiment(plant=so.plants.high_impedance(), log=log, name="chirp", initial_state="rest")
+    fit = so.fit([experiment], thor.update(J=3e-6).free("J", "b_r"), causes=False)
+    assert [each.severity for each in fit.findings if each.kind == "unsearched"] == ["error" if late else "note"]
+    assert fit.met == (late == 0)
 
 
 def test_a_short_log_beside_a_step_is_judged():
