@@ -37,6 +37,6 @@ def run_design(
     seen, values = controller.see(controller.design[0]), [controller.delay(each) for each in sets]
     law = runnable(controller, gate=False, heat=False, outer=controller.outer is not None)
     slowed = replace(law, sample_time_s=law.sample_time_s / rate)
-    devices = {"sensors": sensors or Sensors(), "sticks": sticks}
-    loop = build_loop(controller, seen, [seen.complete(each) for each in values], slowed, **devices)
+    completed = [seen.complete(each) for each in values]
+    loop = build_loop(controller, seen, completed, slowed, sensors=sensors or Sensors(), sticks=sticks)
     return run_loop(loop, values, reference, rtol=RTOL, seed=seed, noise_gain=noise_gain)

@@ -355,8 +355,7 @@ def _find_peaks(
         for seed in range(groups):
             part = sets[seed::groups]
             signs = np.resize([1.0, -1.0], len(part))  # of the noise, which is the same in all runs of a call
-            options: dict[str, Any] = {"sensors": noise, "seed": seed, "noise_gain": signs, "sticks": sticks}
-            run = run_design(runs, part, given.reference, **options)
+            run = run_design(runs, part, given.reference, sensors=noise, seed=seed, noise_gain=signs, sticks=sticks)
             signals = {**run.outputs, controller.command.input: run.current}
             rng = np.random.default_rng((SEED, seed))
             for name, (std, step) in errors.items():

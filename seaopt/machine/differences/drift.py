@@ -27,7 +27,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from seaopt.control import Controller, sample
 from seaopt.machine.differences.comparison import TOLERATED
@@ -170,6 +170,12 @@ def _average(ticks: Ticks, off: Float[np.ndarray, " n"], period: int, starts: Se
     )  # fmt: skip
 
 
+def _centre(groups: Bool[np.ndarray, "p g"], *columns: Shaped[np.ndarray, " p"]) -> Iterator[Float[np.ndarray, " p"]]:
+    """Yield columns over periods without the mean of each group."""
+    at = groups / np.sum(groups, axis=0)
+    return (column - groups @ (at.T @ column) for column in columns)
+
+
 def _fit_slope(means: Means, groups: Bool[np.ndarray, "p g"]) -> Change:
     """Return by how much the means change over a log if evenly, by a line with an offset of each group."""
     from scipy.special import stdtrit  # deferred: 0.1 s
@@ -177,8 +183,7 @@ def _fit_slope(means: Means, groups: Bool[np.ndarray, "p g"]) -> Change:
     free = means.first.size - groups.shape[1] - 1
     if free < 1:
         return UNKNOWN
-    at = groups / np.sum(groups, axis=0)
-    time, mean = (column - groups @ (at.T @ column) for column in (means.first, means.mean))
+    time, mean = _centre(groups, means.first, means.mean)
     spread = float(time @ time)
     slope = float(time @ mean) / spread
     left = float(np.sum((mean - slope * time) ** 2))
@@ -221,8 +226,7 @@ def _find_share(apart: Means, other: Means, held: float) -> tuple[float, float]:
     from scipy.special import stdtrit  # deferred: 0.1 s
 
     groups = other.sets if held else other.levels
-    at = groups / np.sum(groups, axis=0)
-    ours, theirs = (column - groups @ (at.T @ column) for column in (apart.mean, other.mean))
+    ours, theirs = _centre(groups, apart.mean, other.mean)
     power, low, high = float(ours @ ours), -math.inf, math.inf
     if power and other.free:
         reach = float(stdtrit(other.free, 1.0 - 0.5 * RISK)) * other.std / math.sqrt(power)
