@@ -145,10 +145,9 @@ def _find_law(
 def judge_logs(context: CheckContext, _: Progress) -> Evidence:
     """Judge the law on every log of the fit that is of one of its plants, and was taken where a schedule stands."""
     controller, fit = context.cases.controller, context.source
-    asked = controller.spec.level("max_sensitivity")
-    limit = ANY_MS if asked is None else asked
     if not isinstance(fit, Fit):
         return Evidence()
+    limit = controller.spec.level("max_sensitivity") or ANY_MS
     names = {plant.name for plant in context.cases.models.values()}
     logs = [each for each in (*fit.experiments, *fit.validation) if each.plant.name in names]
     if context.place is not None:
@@ -156,7 +155,6 @@ def judge_logs(context: CheckContext, _: Progress) -> Evidence:
     judged = [judge_log(controller, fit, experiment, limit) for experiment in logs]
     verdicts = tuple(verdict for of_log, _ in judged for verdict in of_log)
     rows = [row for each in verdicts for row in _list_log_rows(each, limit * (1.0 + GRACE))]
-    rows = [row for row in rows if asked is not None or row.name != LOG_SENSITIVITY or not row.met]
     remarks = [SILENT[silent.why].format(silent) for _, silent in judged if silent is not None]
     if fit.experiments and not logs and context.place is None:
         remarks.append(NO_LOG)
@@ -164,10 +162,13 @@ def judge_logs(context: CheckContext, _: Progress) -> Evidence:
 
 
 def _list_log_rows(log: LogVerdict, limit: float) -> Iterator[Requirement]:
-    """Yield what a log says of the law, and of the model that the other checks judge it by, each with its risk."""
+    """Yield what a log says of the law, where that breaks what is asked of it or anything is, and of the model that the
+    other checks judge it by, each with its risk.
+    """
     plant, independent = f"log:{log.experiment}", log.confidence is not None
     risk = None if log.confidence is None else 1.0 - log.confidence
-    yield require_at_most(LOG_SENSITIVITY, log.ms_least, limit, plant=plant, text=describe_log(log), risk=risk)
+    if limit < ANY_MS or log.outcome == "refuted":
+        yield require_at_most(LOG_SENSITIVITY, log.ms_least, limit, plant=plant, text=describe_log(log), risk=risk)
     if log.agreement is not None:
         yield require_at_most(
             LOG_AGREEMENT,
