@@ -416,26 +416,25 @@ def _explain_worse(fit: Fit, where: str) -> str:
 
 def _find_held_out(fit: Fit, holdout: float) -> Iterator[FitFinding]:
     """Yield outputs that are explained far less where they were held out."""
-    for where, fitted in _list_outputs(fit):
+    outputs = ((e, y, fitted) for e in fit.experiments for y, fitted in fit.outputs[e.name].items())
+    for e, y, fitted in outputs:
         if fitted.holdout_fit_percent is None or not math.isfinite(fitted.holdout_fit_percent):
             continue
         held_out, used = find_energy(fitted.holdout_fit_percent), find_energy(fitted.fit_percent)
         worse = (1.0 - held_out) / max(1.0 - used, 1e-300)
-        if worse >= WORSE_HELD_OUT**2 and held_out <= 0.99 * used and not _leaves_noise(fit, where, holdout):
+        if worse >= WORSE_HELD_OUT**2 and held_out <= 0.99 * used and not _leaves_noise(e, y, fitted, holdout):
             text = (
                 f"{100 * used:.4g} % is explained of the samples used and {100 * held_out:.4g} % of those held out: "
                 "the plant changed, is excited elsewhere, or the fit follows what does not repeat; log longer, or fix "
                 "parameters"
             )
-            yield _warn("held_out", where, text, bad=held_out < HELD_OUT * used)
+            yield _warn("held_out", f"{e.name}.{y}", text, bad=held_out < HELD_OUT * used)
 
 
-def _leaves_noise(fit: Fit, where: str, holdout: float) -> bool:
+def _leaves_noise(experiment: Experiment, output: str, fitted: OutputFit, holdout: float) -> bool:
     """Tell whether what is left of an output's samples held out is its sensor's noise: a chirp that ends where the
     plant hardly answers leaves little else to explain there.
     """
-    experiment, output = next((e, y) for e in fit.experiments for y in e.outputs if f"{e.name}.{y}" == where)
-    fitted = fit.outputs[experiment.name][output]
     spread = float(np.nanstd(experiment.log[output][experiment.count_fitted(holdout) :]))
     left = (1.0 - (fitted.holdout_fit_percent or 0.0) / 100.0) * spread
     return left <= NOISE_HELD_OUT * fitted.rms_residual / (fitted.excess or math.inf)
