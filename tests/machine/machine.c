@@ -34,8 +34,9 @@ typedef struct {
 static void rate(const machine *m, const double *x, double i, double *d)
 {
     double s = m->mass2 > 0 ? m->stiffness2 * (x[0] - x[2]) + m->damping2 * (x[1] - x[3]) : 0.0;
+    double rub = m->coulomb != 0 ? m->coulomb * tanh(x[1] / m->smoothing) : 0.0; /* tanh is half of a run */
     d[0] = x[1];
-    d[1] = (m->per_ampere * i - m->damping * x[1] - m->coulomb * tanh(x[1] / m->smoothing) - m->stiffness * x[0] - s) / m->mass;
+    d[1] = (m->per_ampere * i - m->damping * x[1] - rub - m->stiffness * x[0] - s) / m->mass;
     d[2] = x[3];
     d[3] = m->mass2 > 0 ? s / m->mass2 : 0.0;
 }
