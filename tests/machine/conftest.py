@@ -70,13 +70,24 @@ def observed():
     return replace(law, law=made, gains=gains.by_name(), observer=observer), Machine.of_knee(values)
 
 
-def make_dry(compiler, folder, periods):
-    """Return the bench of a law for a plant with dry friction, and its reference of six sets of phases."""
+@pytest.fixture(scope="package")
+def dry_bench(compiler, tmp_path_factory):
+    """Return the bench of a law for a plant with dry friction."""
     values = so.plants.thor().update(f_c=FRICTION, v_s=5e-3)
     spec = so.ControllerSpec(bandwidth_hz=30, max_sensitivity=1.6, max_noise_gain=45, current_limit_A=9.0)
-    law = so.tune(so.plants.high_impedance(), values, spec)
-    played = design_excitation(law, share=0.5, bias=0.0, phases=6, periods=periods, limits={"F1": 600.0}, seed=1)
-    return Bench(compiler, folder, law), played.reference
+    return Bench(compiler, tmp_path_factory.mktemp("dry"), so.tune(so.plants.high_impedance(), values, spec))
+
+
+def play_against_friction(bench, periods):
+    """Return a reference of six sets of phases for that bench."""
+    options = {"share": 0.5, "bias": 0.0, "phases": 6, "limits": {"F1": 600.0}, "seed": 1}
+    return design_excitation(bench.controller, periods=periods, **options).reference
+
+
+@pytest.fixture(scope="package")
+def dry(dry_bench):
+    """Return that bench, and a reference of four periods of each set."""
+    return dry_bench, play_against_friction(dry_bench, 4)
 
 
 @pytest.fixture(scope="package")

@@ -16,7 +16,7 @@ from seaopt.machine.differences.drift import find_drifts
 from seaopt.machine.page.page import write_acceptance_page
 from seaopt.machine.ticks import take_ticks
 from seaopt.machine.wording import say_drift
-from tests.machine.conftest import FRICTION, make_dry
+from tests.machine.conftest import FRICTION
 from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
 
@@ -100,22 +100,22 @@ def test_an_encoder_that_creeps_refuses_nothing(controller, bench, rate):
     assert "q drifts by 11 N in 11 s beside F1" in say_drift(drift, "I"), drift
 
 
-@pytest.mark.parametrize("dry", [False, True])
-def test_an_encoder_that_creeps_beside_much_noise_refuses_no_right_machine(compiler, tmp_path, bench, dry):
+@pytest.mark.parametrize("rubs", [False, True])
+def test_an_encoder_that_creeps_beside_much_noise_refuses_no_right_machine(bench, dry, rubs):
     """39 of 40 were refused: whether the command stays where it was, to 2 % of a small reading, is lost in noise. How
     much of what the encoder has it does not have is told all the same; and no reading that drifts is let go for it.
     """
     rng = np.random.default_rng(5)
-    if dry:
-        bench, reference = make_dry(compiler, tmp_path, periods=4)
+    if rubs:
+        bench, reference = dry
     told = {"encoder": [], "reading": []}
     for seed in range(20):
         share, eta, damping, stiffness = rng.uniform(0.3, 1.0), *rng.uniform(0.8, 1.2, 3)
-        if not dry:
+        if not rubs:
             reference = multisine(PERIOD, LINES, 8, 80.0, seed)
         machine = replace(
             RIGHT, per_ampere=eta * RIGHT.per_ampere, damping=damping * RIGHT.damping,
-            stiffness=stiffness * RIGHT.stiffness, coulomb=FRICTION * rng.uniform(0.5, 1.5) * dry, smoothing=5e-3,
+            stiffness=stiffness * RIGHT.stiffness, coulomb=FRICTION * rng.uniform(0.5, 1.5) * rubs, smoothing=5e-3,
         )  # fmt: skip
         played = share * reference
         creep = rng.uniform(5.0, 40.0) * np.arange(played.size) / played.size
@@ -124,8 +124,8 @@ def test_an_encoder_that_creeps_beside_much_noise_refuses_no_right_machine(compi
         for name, each, force in (("encoder", log, log["F1"] + creep), ("reading", drifting, drifting["F1"] - creep)):
             found = find(bench.controller, with_encoder(each, force, machine.stiffness))
             told[name] += [drift.of_reading for drift in found if drift.beside == "q"]
-    assert True not in told["encoder"] and told["encoder"].count(False) >= (12 if dry else 19), told
-    assert False not in told["reading"] and told["reading"].count(True) >= (6 if dry else 17), told
+    assert True not in told["encoder"] and told["encoder"].count(False) >= (12 if rubs else 19), told
+    assert False not in told["reading"] and told["reading"].count(True) >= (6 if rubs else 17), told
 
 
 def test_an_encoder_or_a_reading_that_the_log_does_not_tell_apart_is_undecided(controller, bench):
@@ -163,9 +163,9 @@ def test_a_drive_that_drifts_leaves_a_reading_that_an_encoder_goes_with(controll
     assert all(each.low < truth < each.high for each in (alone, beside)), (alone, truth)
 
 
-def test_a_drift_is_told_beside_dry_friction(compiler, tmp_path):
+def test_a_drift_is_told_beside_dry_friction(dry):
     """Whose mean over a period is another one in each set of phases, by more than the sensor drifts."""
-    bench, reference = make_dry(compiler, tmp_path, periods=4)
+    bench, reference = dry
     machine = replace(RIGHT, coulomb=FRICTION, smoothing=5e-3)
     for drift in (0.0, 0.5):
         log = bench.log(machine, reference, noise=0.5, drift=drift)
@@ -175,11 +175,11 @@ def test_a_drift_is_told_beside_dry_friction(compiler, tmp_path):
 
 
 @pytest.mark.parametrize("share", [1.0, 0.05])
-def test_a_jump_is_told_beside_dry_friction_by_an_encoder_or_its_size(compiler, tmp_path, share):
+def test_a_jump_is_told_beside_dry_friction_by_an_encoder_or_its_size(dry, share):
     """Beside the command alone one of less than four times the friction is as of a motor that it holds, so that it does
     not tell whether the encoder jumps.
     """
-    bench, reference = make_dry(compiler, tmp_path, periods=4)
+    bench, reference = dry
     machine = replace(RIGHT, coulomb=FRICTION, smoothing=5e-4)
     # at 13.4 s no period is judged: another set of phases begins, which has another offset beside the command
     for size, at, told in ((0.0, 11400, []), (40.0, 11400, ["q"]), (40.0, 13400, ["q"]), (250.0, 11400, ["q", "I"])):
@@ -209,19 +209,19 @@ def test_no_drift_is_seen_where_friction_holds_a_knee(compiler, tmp_path, observ
         assert not find(law, bench.log(knee, reference, noise=0.02, seed=seed)), (share, bias, friction, smoothing)
 
 
-@pytest.mark.parametrize("dry", [False, True])
-def test_no_drift_is_seen_where_there_is_none(compiler, tmp_path, controller, bench, dry):
+@pytest.mark.parametrize("rubs", [False, True])
+def test_no_drift_is_seen_where_there_is_none(bench, dry, rubs):
     """Of machines of another efficiency, friction, spring and noise, 40 of each kind."""
     rng = np.random.default_rng(11)
-    if dry:
-        bench, reference = make_dry(compiler, tmp_path, periods=4)
+    if rubs:
+        bench, reference = dry
     for seed in range(40):
-        if not dry:
+        if not rubs:
             reference = multisine(PERIOD, LINES, 8, rng.uniform(20.0, 80.0), seed, bias=rng.uniform(-300.0, 300.0))
         eta, damping, stiffness = rng.uniform(0.8, 1.2, 3)
         machine = replace(
             RIGHT, per_ampere=eta * RIGHT.per_ampere, damping=damping * RIGHT.damping,
-            stiffness=stiffness * RIGHT.stiffness, coulomb=FRICTION * rng.uniform(0.5, 1.5) * dry, smoothing=5e-3,
+            stiffness=stiffness * RIGHT.stiffness, coulomb=FRICTION * rng.uniform(0.5, 1.5) * rubs, smoothing=5e-3,
         )  # fmt: skip
         log = bench.log(machine, reference, noise=rng.uniform(0.1, 4.0), seed=seed)
         assert not find(bench.controller, with_encoder(log, log["F1"], machine.stiffness)), (seed, machine)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from tests.machine.conftest import FRICTION, make_dry
+from tests.machine.conftest import FRICTION, play_against_friction
 from tests.machine.simulator import Machine, multisine
 
 RIGHT = replace(Machine(), coulomb=FRICTION, smoothing=5e-3)
 
 
 @pytest.fixture(scope="module")
-def dry(compiler, tmp_path_factory):
-    return make_dry(compiler, tmp_path_factory.mktemp("dry"), periods=8)
+def dry(dry_bench):
+    return dry_bench, play_against_friction(dry_bench, 8)
 
 
 LINES = np.unique(np.round(np.geomspace(2, 180, 24)).astype(int))

@@ -11,9 +11,7 @@ import seaopt as so
 from seaopt.machine.differences import explanations
 from tests.machine.simulator import Machine, multisine
 from tests.machine.test_drive_limit import REFERENCE
-from tests.machine.test_response import FRICTION, LINES, dry
-
-__all__ = ["dry"]  # a fixture
+from tests.machine.test_response import FRICTION, LINES
 
 RIGHT = Machine()
 RANGES = {"eta": (0.98, 1.02), "b_r": (0.95 * 1.31e-4, 1.05 * 1.31e-4)}

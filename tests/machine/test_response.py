@@ -19,7 +19,7 @@ from seaopt.machine.response.measured_margins import list_margins
 from seaopt.machine.response.periods import LeftOut, cut_periods, find_period, join_blocks
 from seaopt.machine.response.verdicts import Measured, judge_response, measure
 from seaopt.machine.ticks import take_ticks
-from tests.machine.conftest import FRICTION, make_dry
+from tests.machine.conftest import FRICTION
 from tests.machine.simulator import Bench, Machine, multisine
 
 LINES = np.unique(np.round(np.geomspace(1, 150, 40)).astype(int))
@@ -378,11 +378,6 @@ def test_what_is_divided_by_nothing_sure_has_the_set_of_fieller():
     unsure = ~ratio.sure
     held, known = np.mean((np.abs(centre - truth) <= radius)[unsure]), np.mean(np.isfinite(radius[unsure]))
     assert np.mean(unsure) > 0.5 and held > 0.86 and known < 1.0
-
-
-@pytest.fixture(scope="module")
-def dry(compiler, tmp_path_factory):
-    return make_dry(compiler, tmp_path_factory.mktemp("dry"), periods=4)
 
 
 def test_with_dry_friction_what_is_predicted_is_of_the_reference_that_was_played(dry):
