@@ -33,6 +33,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import expm
 
 from seaopt.control.loops.sampled_plant import find_delay, read_conditions, whole_samples
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
@@ -54,7 +55,10 @@ MAX_LOOP_SUBSTEPS = 512
 ALIKE = 0.5  # of its largest value, by which a state of a run that is lost may differ between two numbers of steps
 FASTEST_GUESSED = 1e6  # of a mode, radians a sample: beyond, the guess is the largest, and a power may overflow
 RTOL, STICKING_RTOL = 1e-6, 1e-4
-RESTS = 1e-10  # of the largest state: a state below it is at rest but for rounding
+# A state below that share of the largest, or of what a sample without friction makes of it, is at rest: but for
+# rounding; but for a step's own error where a joint sticks, which lets it creep while the command changes in a sample.
+RESTS, STICKING_RESTS = 1e-10, 1.0
+DOUBLINGS = 7  # of the time in which that is looked for: to 64 samples
 
 
 @record(eq=False)
@@ -203,7 +207,7 @@ def run_loop(
         arrays = execute(job, substeps)
         wall_s += time.perf_counter() - begin
         kept = _first_lost_sample(arrays) == n
-        errors = _errors(arrays, motion, unheld) / (1.0 if loop.sticks else 15.0)
+        errors = _errors(arrays, motion, unheld, sticks=loop.sticks) / (1.0 if loop.sticks else 15.0)
         error = float(np.max(errors[kept], initial=0.0))
         shortest = 2 * substeps > MAX_LOOP_SUBSTEPS
         decided = bool(np.all(kept)) or (
@@ -229,7 +233,7 @@ def run_loop(
 
 
 def _errors(
-    arrays: LoopArrays, motion: Float[np.ndarray, " nx"], unheld: Float[np.ndarray, "runs nx"]
+    arrays: LoopArrays, motion: Float[np.ndarray, " nx"], unheld: Float[np.ndarray, "runs nx"], *, sticks: bool
 ) -> Float[np.ndarray, "runs nx"]:
     """Return the largest differences of two numbers of steps in a sample, over the state's largest value. A state that
     rests, or that friction holds, has rounding for a value: it is measured by the largest of the others, by `motion`,
@@ -237,7 +241,8 @@ def _errors(
     """
     free = motion * np.max(np.abs(arrays.applied), axis=1, keepdims=True, initial=0.0) + unheld
     with np.errstate(invalid="ignore"):
-        size = np.maximum(arrays.size, RESTS * np.maximum(free, np.max(arrays.size, axis=1, keepdims=True)))
+        resting = RESTS * np.max(arrays.size, axis=1, keepdims=True)
+        size = np.maximum(np.maximum(arrays.size, resting), (STICKING_RESTS if sticks else RESTS) * free)
         scale = np.where(size > 0.0, size, 1.0)
         return np.nan_to_num(arrays.error / scale, nan=np.inf)
 
@@ -354,7 +359,15 @@ def _push_at_start(plant: Plant, params: CompletedParameters, x: Float[np.ndarra
 def _bound_motion(
     a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], period: float
 ) -> Float[np.ndarray, " nx"]:
-    """Return about how far rates b move each state in a sample: three terms of a Taylor series."""
-    with np.errstate(over="ignore", invalid="ignore"):  # a plant beyond computing has no motion to measure by
-        terms = [np.abs(np.linalg.matrix_power(a, k) @ b) * period ** (k + 1) / math.factorial(k + 1) for k in range(3)]
-        return np.nan_to_num(np.sum(terms, axis=0), nan=0.0, posinf=0.0)
+    """Return about how far rates b move each state in a sample: the most that they do in 1, 2, 4, ... samples, over the
+    square of their number, since what only a spring moves has hardly begun to in the first.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        whole = period * np.block([[a, b[:, None]], [np.zeros((1, len(b) + 1))]])
+        if not np.all(np.isfinite(whole)):  # a plant beyond computing has no motion to measure by
+            return np.zeros_like(b)
+        whole, motion = expm(whole), np.zeros_like(b)
+        for doubling in range(DOUBLINGS):
+            motion = np.fmax(motion, np.abs(whole[:-1, -1]) / 4.0**doubling)
+            whole = whole @ whole
+    return np.nan_to_num(motion, posinf=0.0)
