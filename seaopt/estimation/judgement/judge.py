@@ -152,10 +152,11 @@ def judge(
     tests = {} if standing == "certain" else _run_tests(fit, minimum, freed)
     suspects = {name: test for name, test in tests.items() if test.p < DOUBTFUL}
     if standing == "certain" or not causes:
-        asks = suspects or leaves_something(fit, findings, error, ASKS) or _hangs_on_little(fit, findings)
-        unsearched = () if causes else (find_unsearched(asked=bool(asks)),)
-        found = order_findings([*findings, *commanded, *unsearched, *find_step_error(fit)])
-        return _conclude(replace(fit, findings=found))
+        found = [*findings, *commanded, *find_step_error(fit)]
+        if not causes:
+            asks = suspects or leaves_something(fit, findings, error, ASKS) or _hangs_on_little(fit, findings)
+            found.append(find_unsearched(asked=bool(asks)))
+        return _conclude(replace(fit, findings=order_findings(found)))
     if standing == "likely":
         evaluations = EVALUATIONS  # what brings a random force is hardly among the causes
     budget = EvaluationBudget.begin((OF_HYPOTHESES + OF_CAUSES) * evaluations, minimum.problem.count_work(minimum.z))

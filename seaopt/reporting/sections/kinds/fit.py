@@ -109,8 +109,9 @@ def _name_silent(fit: Fit) -> str:
 
 
 def _say_unsearched(fit: Fit) -> str:
-    """Return that causes were not looked for, for the verdict; "" where they were, as far as the fit asked for it."""
-    return "; causes were not looked for" if any(each.kind == "unsearched" for each in fit.findings) else ""
+    """Return that causes were not looked for, for the verdict; "" where they were, or where an error says it."""
+    noted = any(each.kind == "unsearched" and each.severity == "note" for each in fit.findings)
+    return "; causes were not looked for" if noted else ""
 
 
 def _say_silent(fit: Fit) -> Iterator[str]:
