@@ -111,10 +111,16 @@ def test_a_certificate(controller, certified, make):
         assert certify(controller, executor) == certified
 
 
-def certify_friction(executor):
+@cache
+def compensate_friction():
+    """Return a law that compensates friction, and the values of its plant."""
     values = THOR.update(f_c=100.0)
     tuned = so.tune(STAND, values, so.ControllerSpec(bandwidth_hz=20, max_sensitivity=1.6, reserve=0.05))
-    law = add_compensation(tuned, friction=CompensateFriction(fraction=0.9, source="speed"))
+    return add_compensation(tuned, friction=CompensateFriction(fraction=0.9, source="speed")), values
+
+
+def certify_friction(executor):
+    law, values = compensate_friction()
     ranges = {"f_c": (20.0, 120.0), "K_tau": (0.024, 0.027), "I_p": (0.3, 0.5)}
     found = so.certify(
         law, {"stand": STAND, "swing": SWING}, values, ranges=ranges, samples=5, simulations=False, executor=executor
@@ -123,13 +129,19 @@ def certify_friction(executor):
     return found
 
 
-def certify_link(executor):
+@cache
+def render_knee():
+    """Return a law that holds its link's weight and renders an impedance, its plant and the values."""
     knee, held = so.plants.rotary(link="pendulum"), so.plants.rotary(link="locked")
     values = knee.defaults.update(N=50.0, k_s=300.0, J_l=0.3, d_l=0.5, m=4.0, L=0.2, f_c=0.0)
     law = so.tune(held, values, so.ControllerSpec(measured="tau_s", bandwidth_hz=15, max_sensitivity=1.6))
     ripple = CompensateRipple(cycles=(1,), cos=(0.0,), sin=(0.5 * law.command.per_effort,), fraction=1.0)
     law = add_compensation(law, gravity=CompensateGravity(fraction=0.8), ripple=ripple, link=(knee, values))
-    law = add_impedance(law, knee, values, Impedance(stiffness=20.0, damping=1.0), name="knee")
+    return add_impedance(law, knee, values, Impedance(stiffness=20.0, damping=1.0), name="knee"), knee, values
+
+
+def certify_link(executor):
+    law, knee, values = render_knee()
     ranges = {"m": (3.0, 5.0), "k_s": (250.0, 350.0)}
     found = so.certify(law, {"knee": knee}, values, ranges=ranges, samples=5, simulations=False, executor=executor)
     assert found.impedance.draws.samples == 5
@@ -137,25 +149,33 @@ def certify_link(executor):
     return found
 
 
-def certify_points(executor):
+@cache
+def tune_points():
     spec = so.ControllerSpec(structure="pd", bandwidth_hz=20, max_sensitivity=1.6, max_noise_gain=25)
-    schedule = tune_schedule(STAND, THOR, spec, "k", [5e5, 6e5])
+    return tune_schedule(STAND, THOR, spec, "k", [5e5, 6e5])
+
+
+def certify_points(executor):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(schedule_sweep, "PULSE_PERIODS", 1.0)
         found = so.certify(
-            schedule, {"stand": STAND}, THOR, ranges={"J": (3.2e-6, 3.4e-6)}, samples=20, executor=executor
+            tune_points(), {"stand": STAND}, THOR, ranges={"J": (3.2e-6, 3.4e-6)}, samples=20, executor=executor
         )  # fmt: skip
     assert found.places[0].worst["stand"][0] is STAND
     assert len(found.sweeps["stand"]) > 1
     return found
 
 
+@cache
+def design_plan():
+    return force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
+
+
 def certify_plan(executor):
-    mpc = force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=20))
     ranges = {"J": (2e-6, 5e-6)}
     return so.certify(
-        mpc, {"stand": STAND}, THOR, ranges=ranges, samples=20, runs=2, sensors=so.Sensors(noise_std={"F1": 1.0}),
-        executor=executor,
+        design_plan(), {"stand": STAND}, THOR, ranges=ranges, samples=20, runs=2,
+        sensors=so.Sensors(noise_std={"F1": 1.0}), executor=executor,
     )  # fmt: skip
 
 
@@ -190,13 +210,17 @@ def test_a_sweep(swept, make):
         assert sweep_bandwidths(executor) == swept
 
 
-def draw_bootstrap(executor):
+@cache
+def fit_stand():
     rng = np.random.default_rng(1)
     drive = so.Log.from_arrays(time=np.arange(400) / 400, I=rng.normal(size=400))
     force = so.simulate(STAND, THOR, drive)["F1"] + rng.normal(size=400)
     log = so.Log.from_arrays(time=drive.time, I=drive["I"], F1=force)
-    fitted = so.fit([so.Experiment(plant=STAND, log=log, outputs=("F1",))], THOR.free("J", "b_r"))
-    return bootstrap(fitted, draws=20, seed=3, refit=True, executor=executor).draws.tobytes()
+    return so.fit([so.Experiment(plant=STAND, log=log, outputs=("F1",))], THOR.free("J", "b_r"))
+
+
+def draw_bootstrap(executor):
+    return bootstrap(fit_stand(), draws=20, seed=3, refit=True, executor=executor).draws.tobytes()
 
 
 @pytest.fixture(scope="module")
