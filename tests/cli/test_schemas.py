@@ -5,18 +5,17 @@ from __future__ import annotations
 import functools
 import json
 import tomllib
+from pathlib import Path
 
 import pytest
 
-import seaopt as so
 from seaopt.cli.schemas import DOCUMENTS, json_schema
-from seaopt.cli.session import Session
 from seaopt.control.laws.stored import CONTROLLER_SCHEMA
 from seaopt.estimation.result.fit_result import FIT_SCHEMA
 from seaopt.robustness.certificate.certificate import ROBUSTNESS_SCHEMA
-from tests.problem.test_knee import KNEE, TRUTH
 
 jsonschema = pytest.importorskip("jsonschema")
+PROBLEMS = Path(__file__).resolve().parents[2] / "problems"
 RESULTS = {"fit": "fit.json", "controller": "controller.json", "robustness": "robustness.json"}
 
 
@@ -27,7 +26,7 @@ def validator(document):
     return jsonschema.Draft202012Validator(schema)
 
 
-@pytest.mark.parametrize("path", sorted(KNEE.parent.glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(PROBLEMS.glob("*.toml")), ids=lambda path: path.stem)
 def test_problem_files_agree(path):
     content = tomllib.loads(path.read_text(encoding="utf-8"))
     assert not list(validator("problem").iter_errors(content))
@@ -50,33 +49,6 @@ def test_results_agree(done, document):
 )  # fmt: skip
 def test_a_schema_has_the_version_of_the_files(document, written):
     assert json_schema(document)["$id"].rsplit(":", 1)[1] == written.rsplit("/", 1)[1]
-
-
-@pytest.mark.slow  # a run of a rotary joint with friction
-def test_short_logs_of_the_knee_are_fitted_and_tuned_and_their_results_agree(tmp_path):
-    """On shorter logs and fewer draws than the problem file's: the truth within its interval, every limit met, and
-    documents of the same keys.
-    """
-    text = KNEE.read_text(encoding="utf-8")
-    for long, short in (
-        ("duration_s = 30", "duration_s = 3"),
-        ("duration_s = 20", "duration_s = 3"),
-        ("samples = 1375", "samples = 10"),
-    ):
-        assert long in text
-        text = text.replace(long, short)
-    (tmp_path / "knee.toml").write_text(text, encoding="utf-8")
-    session = Session(tmp_path / "knee.toml", tmp_path)
-    for stage in ("fit", "tune", "certify"):
-        session.run(stage)
-    fit, controller = session.results["fit"], session.results["tune"]
-    assert fit.met, fit.verdict
-    so.testing.assert_recovered(fit, session.problem.parameters.update(**TRUTH), sigmas=4)
-    assert controller.feasible, controller.explanation
-    assert controller.command.effort_unit == "N m"
-    for document, name in RESULTS.items():
-        content = json.loads((tmp_path / name).read_text(encoding="utf-8"))
-        assert not [f"{error.json_path}: {error.message}" for error in validator(document).iter_errors(content)]
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

@@ -13,6 +13,7 @@ import pytest
 
 import seaopt as so
 from seaopt.problem import completion
+from tests.cli.test_schemas import validator
 from tests.schedules import read_knee, tune_knee
 from tests.words import check_words
 
@@ -33,9 +34,12 @@ def test_the_knee_runs_with_everything_met(tmp_path):
     own = r"N\s+100\s+gear ratio|m\s+4\s+kg\s+pendulum mass"  # the table's rows of a name and of a mass
     check_words(run.stdout, re.sub(own, "", unescape(page)))
     assert stored["fit"]["met"] and stored["controller"]["feasible"] and stored["robustness"]["passed"]
+    assert stored["controller"]["command"]["effort_unit"] == "N m"
     for name, value in TRUTH.items():
         fitted = stored["fit"]["parameters"][name]
         assert abs(fitted["value"] - value) < 4 * fitted["std"]
+    for name, content in stored.items():
+        assert not list(validator(name).iter_errors(content))
 
 
 def test_critical_damping_is_the_largest_between_the_points_too(monkeypatch):
