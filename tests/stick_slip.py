@@ -7,19 +7,27 @@ A mass on a spring with friction, driven by a sampled law through hold and delay
 which is the actuator with both links fixed. Friction is Coulomb's law, :math:`f \in f_c\,\mathrm{Sgn}(\dot q)` (with
 :math:`f_s` and :math:`v_{st}` Stribeck's), or smoothed by :math:`\tanh(\dot q/v_s)`. It is integrated by the
 theta method (Moreau and Jean's, for set-valued friction) with the friction force implicit: where it sticks the velocity
-is zero, not small. The law is the difference equation of controller.json, stepped by hand; many actuators run at once.
+is zero, not small. The law is the difference equation of controller.json, stepped by hand; many actuators run at once,
+a few one after the other in plain floats, which are quicker then.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 THETA = 0.55  # weight of a step's end: at one half what sticks would not come to rest
 NEWTON_STEPS, NEWTON_ROUNDING = 8, 1e-14
+FEW = 4  # runs; more are quicker at once
+FLOATS = SimpleNamespace(  # what NumPy does with arrays, for one run
+    abs=abs, maximum=max, minimum=min, exp=math.exp, tanh=math.tanh, any=bool, all=bool,
+    where=lambda yes, this, other: this if yes else other, sign=lambda x: math.copysign(1.0, x),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -78,57 +86,66 @@ def simulate(
 
     `reference` is (runs, samples); all laws have one sample time.
     """
-    period = laws[0]["sample_time_s"]
-    n = reference.shape[1]
+    if 1 < len(masses) <= FEW:
+        first = [None] * len(masses) if velocity is None else velocity[:, None]
+        runs = [
+            simulate([mass], [law], row[None], substeps=substeps, velocity=one)
+            for mass, law, row, one in zip(masses, laws, reference, first, strict=True)
+        ]
+        force, effort, largest = (np.concatenate([getattr(run, name) for run in runs])
+                                  for name in ("force", "effort", "largest"))  # fmt: skip
+        return Runs(time=runs[0].time, force=force, effort=effort, largest=largest)
+    period, n, alone = laws[0]["sample_time_s"], reference.shape[1], len(masses) == 1
+    ops = FLOATS if alone else np
     names = ("m", "b", "k", "f_c", "f_s", "v_s", "v_st", "play")
-    m, b, k, f_c, f_s, v_s, v_st, play = (np.array([getattr(each, name) for each in masses]) for name in names)
-    f_s = np.maximum(f_s, f_c)
+    values = [np.array([getattr(each, name) for each in masses], dtype=float) for name in names]
+    values.append(np.zeros(len(masses)) if velocity is None else np.array(velocity, dtype=float))
+    m, b, k, f_c, f_s, v_s, v_st, play, v = (each.item() for each in values) if alone else values
+    f_s = ops.maximum(f_s, f_c)
     h = period / substeps
     reach = THETA * h
-    falls, loose, smooth = np.any(f_s > f_c), np.any(play > 0.0), v_s > 0.0  # what no run has is left out of the steps
+    # What no run has is left out of the steps.
+    falls, loose, smooth = ops.any(f_s > f_c), ops.any(play > 0.0), v_s > 0.0
     friction, inertia = reach * f_c, m + reach * (b + reach * k)
     steps = [_DifferenceEquations(laws, path) for path in ("reference", "measurement")]
     delays = np.array([round(law["delay_samples"], 9) for law in laws]).astype(int, casting="unsafe")
     effort, force = np.zeros((len(masses), n)), np.zeros((len(masses), n))
-    q, largest = np.zeros(len(masses)), np.zeros(len(masses))
-    v = np.zeros(len(masses)) if velocity is None else np.array(velocity, dtype=float)
-    spring = np.zeros(len(masses))
+    q = spring = largest = 0.0 * v
     for sample in range(n):
         force[:, sample] = spring
         effort[:, sample] = steps[0].step(reference[:, sample]) - steps[1].step(force[:, sample])
         before = sample - delays
         applied = np.where(before >= 0, effort[np.arange(len(masses)), np.maximum(before, 0)], 0.0)
+        applied = applied.item() if alone else applied
         for _ in range(substeps):
             if falls:
-                friction = reach * (f_c + (f_s - f_c) * np.exp(-((v / v_st) ** 2)))
+                friction = reach * (f_c + (f_s - f_c) * ops.exp(-((v / v_st) ** 2)))
             if loose:
-                inertia = m + reach * (b + reach * k * (np.abs(q) >= play))
-            mean = _solve_velocity(inertia, m * v + reach * (applied - spring), friction, v_s, smooth)
+                inertia = m + reach * (b + reach * k * (ops.abs(q) >= play))
+            mean = _solve_velocity(ops, inertia, m * v + reach * (applied - spring), friction, v_s, smooth)
             q = q + h * mean
             v = (mean - (1.0 - THETA) * v) / THETA
-            spring = k * (q - np.clip(q, -play, play) if loose else q)
-            largest = np.maximum(largest, np.abs(spring))
-    return Runs(time=period * np.arange(n), force=force, effort=effort, largest=largest)
+            spring = k * (q - ops.minimum(ops.maximum(q, -play), play) if loose else q)
+            largest = ops.maximum(largest, ops.abs(spring))
+    return Runs(time=period * np.arange(n), force=force, effort=effort, largest=np.atleast_1d(largest))
 
 
-def _solve_velocity(
-    inertia: np.ndarray, push: np.ndarray, friction: np.ndarray, v_s: np.ndarray, smooth: np.ndarray
-) -> np.ndarray:
+def _solve_velocity(ops, inertia, push, friction, v_s, smooth):
     """Return the velocity w of inertia w + friction Sgn(w) = push, or where `smooth` with tanh(w/v_s) for Sgn."""
-    size = np.abs(push)
-    w = np.maximum(size - friction, 0.0) / inertia
-    if smooth.any():
-        scale = np.where(smooth, v_s, 1.0)
-        at = np.maximum(w, size / (inertia + friction / scale))  # both are below the root of a concave function
+    size = ops.abs(push)
+    w = ops.maximum(size - friction, 0.0) / inertia
+    if ops.any(smooth):
+        scale = ops.where(smooth, v_s, 1.0)
+        at = ops.maximum(w, size / (inertia + friction / scale))  # both are below the root of a concave function
         for _ in range(NEWTON_STEPS):
-            curve = np.tanh(at / scale)
+            curve = ops.tanh(at / scale)
             slope = inertia + friction / scale * (1.0 - curve**2)
             change = (size - inertia * at - friction * curve) / slope
             at = at + change
-            if np.all(np.abs(change) <= NEWTON_ROUNDING * at):
+            if ops.all(ops.abs(change) <= NEWTON_ROUNDING * at):
                 break
-        w = np.where(smooth, at, w)
-    return np.sign(push) * w
+        w = ops.where(smooth, at, w)
+    return ops.sign(push) * w
 
 
 class _DifferenceEquations:
