@@ -23,13 +23,14 @@ def record(seed, *, lead_s=0.0, noise=1e-3, friction=0.0, seconds=10.0):
     J_m, b_r, k_s = TRUTH.values()
     rates = np.zeros((4, 4))
     rates[:2] = [[0, 1, 0, 0], [-k_s / N**2 / J_m, -b_r / J_m, K_TAU / J_m, -1 / J_m]]
-    step = expm(rates / RATE_HZ / SUBSTEPS)[:2]
-    x, angle = np.zeros(2), np.empty(t.size)
-    for i, value in enumerate(current):
-        angle[i] = x[0]
+    (a, b, c, d), (e, f, g, h) = expm(rates / RATE_HZ / SUBSTEPS)[:2].tolist()
+    x, v, angle = 0.0, 0.0, np.empty(t.size)
+    for i, value in enumerate(current.tolist()):  # plain floats: a tenth of the time of NumPy's
+        angle[i] = x
         for _ in range(SUBSTEPS):
-            x = step[:, :2] @ x + step[:, 2] * value
-            x = x + step[:, 3] * np.clip(-x[1] / step[1, 3], -friction, friction)
+            x, v = a * x + b * v + c * value, e * x + f * v + g * value
+            stop = min(max(-v / h, -friction), friction)
+            x, v = x + d * stop, v + h * stop
     read = angle[before:] + noise * rng.normal(size=t.size - before)
     return so.Log.from_arrays(time=t[: t.size - before], I=current[before:], theta_m=read)
 
