@@ -14,7 +14,7 @@ from seaopt.logs import Column, Log, contents, read_log, read_table
 from seaopt.logs.formats import Field
 from seaopt.logs.quality.clock import JITTER_LIMIT, assess_clock, shorten_rate, split_at_gaps
 from seaopt.logs.reading.selection import ClockError
-from seaopt.problem.bench_tables import ExperimentTable
+from seaopt.problem.bench_tables import AcceptanceTable, ExperimentTable
 from seaopt.problem.columns import make_column
 from seaopt.problem.problem import Problem
 from seaopt.signals import REFERENCE, REFERENCES, STATUS, RawLog, VectorN
@@ -38,15 +38,17 @@ def read_loop_log(
 ) -> Log:
     """Return a log taken under a law, with the channels that the law has and its reference.
 
-    A column is that of [acceptance], else of the experiment of the controller's plant, else of the channel's own name.
+    A column is that of [acceptance], else of the experiment of the controller's plant, else of the channel's own name;
+    a log that the exported C wrote has the channels' own names and its own clock, and [acceptance] is of others.
     One that states no unit has the law's. `units`: of each channel, that of the reference by the name "reference".
     `reference`: its column, by the header, with its unit or without. `beside`: channels that are read, too, with their
     units, where the log has the column that the experiment or [acceptance] gives them. `at_rest`: channels that may be
     constant, besides these, and are not noted then. Raises LogError: a column is
     missing, or the log cannot be read.
     """
-    table = problem.table.acceptance
-    fields = {field.name: field for field in contents(path).fields}
+    file = contents(path)
+    table = AcceptanceTable() if file.law else problem.table.acceptance
+    fields = {field.name: field for field in file.fields}
     template = _find_template(problem)
     columns = {} if template is None else {**template.inputs, **template.outputs}
     columns = {**columns, **table.columns} | ({} if table.reference is None else {REFERENCE: table.reference})

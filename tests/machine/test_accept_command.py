@@ -13,6 +13,7 @@ import pytest
 import seaopt as so
 from seaopt.cli.main import app
 from seaopt.cli.session import Session
+from seaopt.errors import LogError
 from seaopt.files import to_json, write_json
 from seaopt.machine import bring_up
 from seaopt.problem.loop_logs import read_loop_log
@@ -104,6 +105,15 @@ def test_a_log_of_the_target_is_taken_as_it_is(folder, accept):
     assert other.exit_code == 1 and "another, 0123456789abcdef" in other.output
     cut = accept(folder / "cut.sealog")
     assert "header is cut off or damaged" in str(cut.exception)
+
+
+def test_a_log_of_the_target_has_its_own_names_whatever_the_problem_says_of_others(folder):
+    others = '[acceptance]\nreference = "goal [N]"\ntime = "clock"\nrate_hz = 500\ncolumns = { I = "iq [mA]" }\n'
+    (folder / "others.toml").write_text(PROBLEM + others)
+    log = read_loop_log(so.read_problem(folder / "others.toml"), folder / "good.sealog", {"reference": "N", "I": "A"})
+    assert set(log.signals) == {"reference", "I"} and round(log.period, 9) == 1e-3
+    with pytest.raises(LogError, match="goal"):
+        read_loop_log(so.read_problem(folder / "others.toml"), folder / "good.csv", {"reference": "N", "I": "A"})
 
 
 def test_columns_without_units_and_with_other_names_are_read(folder, accept):

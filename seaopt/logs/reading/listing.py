@@ -24,12 +24,15 @@ class Contents:
         Name, kind, length, unit and clock of each column; the name is what `Column(column=...)` takes.
     notes : tuple of str
         Remarks on how the file was read.
+    law : str
+        Hash of the law that wrote it, of a log that the exported C wrote.
     """
 
     path: str
     format: str
     fields: tuple[Field, ...]
     notes: tuple[str, ...]
+    law: str = ""
 
     def __repr__(self) -> str:
         rows = [
@@ -71,4 +74,4 @@ def contents(path: str | Path) -> Contents:
     """
     require_type(path, (str, Path), "path", "give a path", LogError)
     source = open_source(Path(path))
-    return Contents(path=str(path), format=source.format, fields=source.fields, notes=source.notes)
+    return Contents(path=str(path), format=source.format, fields=source.fields, notes=source.notes, law=source.law)
