@@ -365,9 +365,9 @@ def accept(
                 tried.append((before, replay(controller, before, others)))
         chosen, row = max(tried, key=lambda pair: (pair[1].met, pair[1].explained, pair[1].undecided))
         unit_missing = bool(unclear) and not row.met and not row.explained
-        stays = chosen.position_stays
-        row = replace(row, unit_missing=unit_missing, begins=chosen.begins, position_stays=stays)
-        if chosen.gaps is not None and chosen.rendered is None and row.met and row.ticks_per_row == 1:
+        row = replace(row, unit_missing=unit_missing, begins=chosen.begins, position_stays=chosen.position_stays)
+        split = chosen.gaps is not None and chosen.rendered is None and row.ticks_per_row == 1
+        if split and (row.met or not np.any(chosen.command)):
             (whole,) = list_ticks(controller, [log], reference, at, whole=True)
             row = replay_stretches(controller, row, chosen, whole, others or {})
         row = _check_header(controller, log, _check_column(law, log, row, reference), others or {})

@@ -188,7 +188,7 @@ def name_factor(what: str, value: float, signals: Sequence[str]) -> tuple[str, f
     unit = next((each for each in UNITS if abs(value / each - 1.0) < SAME_FACTOR), None)
     if abs(value + 1.0) < SAME_FACTOR:
         return "sign", -1.0
-    if abs(value) < SAME_FACTOR and what in signals:
+    if unit is None and abs(value) < SAME_FACTOR and what in signals:
         return "open loop", value
     return ("factor", value) if unit is None else ("unit", unit)
 

@@ -20,7 +20,7 @@ from seaopt.machine.open_loop import find_unfollowed
 from seaopt.machine.reference_offset import Offset, tell_offset
 from seaopt.machine.response.tripped import Trip
 from seaopt.machine.stepped import FLOOR, Match, Others, Setting, Source, make_setting, play
-from seaopt.machine.stopped import find_stop
+from seaopt.machine.stopped import find_end, find_stop
 from seaopt.machine.ticks import Ticks, find_saturated
 from seaopt.records import Result, record
 
@@ -132,19 +132,23 @@ def _find_open(whole: Setting, match: Match, first: Cause | None) -> str | None:
 
 
 def replay_stretches(source: Source, row: Replay, longest: Ticks, whole: Ticks, others: Others) -> Replay:
-    """Return the replay of all stretches of a log with gaps, the longest of which is of the law, as `row` has it.
+    """Return the replay of all stretches of a log with gaps, the longest of which is of the law, as `row` has it; or
+    where that one has no command, of what was before.
 
     Each begins in a state that the log does not have, and that its own first rows tell, as at the start of a log; what
     a stretch of few rows says is therefore less than what it would as a part of a longer one. Rounding, and what is as
     good as nothing, are those of the longest.
     """
+    if not row.met:
+        return _replay_before_stop(source, row, whole, others)
     stretches = whole.move_command(row.command_late).split()
     matches = list[Match]()
     for ticks in stretches:
         setting = replace(make_setting(source, ticks), log=longest)
         match = play(setting)
         if not match.met:
-            causes, _ = find_causes(setting, match, others)
+            stop = None if np.any(ticks.command) else find_end(whole)
+            causes = find_causes(setting, match, others)[0] if stop is None else (stop,)
             worst = float(np.max(np.abs(match.error)))
             return replace(row, met=False, mismatch=math.sqrt(match.energy), largest=worst, causes=causes)
         matches.append(match)
@@ -158,6 +162,18 @@ def replay_stretches(source: Source, row: Replay, longest: Ticks, whole: Ticks, 
         mismatch=math.sqrt(float(np.mean(errors**2))),
         largest=float(np.max(np.abs(errors))),
     )
+
+
+def _replay_before_stop(source: Source, row: Replay, whole: Ticks, others: Others) -> Replay:
+    """Return the replay of a log whose longest stretch has no command: of the longest before, and that the command was
+    stopped, where that one is of the law; else `row`.
+    """
+    stop = find_end(whole)
+    moving = [ticks for ticks in whole.split() if np.any(ticks.command)]
+    if stop is None or not moving:
+        return row
+    before = replay(source, max(moving, key=len), others)
+    return replace(before, met=False, causes=(stop,)) if before.met else row
 
 
 def _read_counts(

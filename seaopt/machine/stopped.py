@@ -8,7 +8,7 @@ import numpy as np
 
 from seaopt.machine.causes import Cause
 from seaopt.machine.stepped import Match, Setting, play
-from seaopt.machine.ticks import FEWEST
+from seaopt.machine.ticks import FEWEST, Ticks
 
 SIGMAS = 6.0  # of what rounding allows, from which on the command is another one
 
@@ -29,3 +29,15 @@ def find_stop(whole: Setting, match: Match) -> Cause | None:
     if not play(replace(whole, ticks=ticks.take(slice(0, first)))).met:
         return None
     return Cause(kind="stopped", what="command", value=last / ticks.rate_hz, unit="s", removes=1.0, explains=True)
+
+
+def find_end(whole: Ticks) -> Cause | None:
+    """Return since when the command of a log is none, where that is so behind a gap: with readings that were no
+    numbers, of which a gate makes a fault, no stretch has both the law and its stop.
+    """
+    moving = np.flatnonzero(np.nan_to_num(whole.command))
+    last = int(moving[-1]) + 1 if moving.size else 0
+    if not last or np.count_nonzero(whole.complete[last:]) < FEWEST:
+        return None
+    value = last / whole.rate_hz
+    return Cause(kind="stopped", what="command", value=value, unit="s", removes=1.0, explains=True)

@@ -100,3 +100,15 @@ def test_a_gate_of_the_firmware_that_tripped_is_a_stop(compiler, tmp_path, contr
     log = bench.log(Machine(), reference)
     first = so.accept(controller, [log]).replays[0].causes[0]
     assert (first.kind, first.what) == ("stopped", "command") and 3.0 < first.value < 3.5
+
+
+@pytest.mark.parametrize("lost", [1000, 3000])
+def test_a_gate_that_tripped_of_readings_that_are_no_numbers_is_a_stop(compiler, tmp_path, controller, lost):
+    gate = PlausibilityGate(range_N=(-1500.0, 1500.0), max_step_N=1000.0, max_held=3, ramp_per_s=50.0)
+    bench = Bench(compiler, tmp_path, replace(controller, gate=gate))
+    off = np.zeros(REFERENCE.size)
+    off[lost : lost + 400] = np.nan  # a wire that is loose: after it no row has the law, before it none the stop
+    result = so.accept(replace(controller, gate=gate), [bench.log(Machine(), REFERENCE, drift=off)])
+    first = result.replays[0].causes[0]
+    assert (first.kind, first.what) == ("stopped", "command") and not result.met
+    assert lost <= 1000.0 * first.value <= lost + 400

@@ -114,6 +114,7 @@ def test_a_command_that_is_logged_a_row_late_or_early_is_allowed(controller, ben
     [
         ({"law_gain": 0.5}, ("factor", "I", 0.5)),
         ({"reading_sign": -1.0}, ("sign", "F1", -1.0)),
+        ({"reading_sign": 1e-3}, ("unit", "F1", 1e-3)),  # of which a command hardly shows more than of an open loop
         ({"every": 2.0}, ("rate", "law", 500.0)),
     ],
 )
@@ -166,9 +167,11 @@ def test_counts_of_another_law_are_no_rounding_either(controller, bench):
 
 
 def test_a_sign_is_listed_once(controller, bench):
-    (row,) = so.accept(controller, [bench.log(replace(Machine(), reading_sign=-1.0), REFERENCE)]).replays
+    result = so.accept(controller, [bench.log(replace(Machine(), reading_sign=-1.0), REFERENCE)])
+    (row,) = result.replays
     causes = [(cause.kind, cause.what, cause.value) for cause in row.causes]
     assert ("sign", "F1", -1.0) in causes and len(set(causes)) == len(causes)
+    assert row.saturated > 0.995 and "  100 %  1000" in str(result)  # at limit, rate
 
 
 def test_readings_that_a_log_rounds_are_still_allowed_for(controller, bench):

@@ -346,7 +346,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
             Mark(text="undecided", style="warning") if row.undecided else mark_met(row.met),
             str(row.ticks),
             *(format_number(value, 3) for value in (row.mismatch, row.largest, row.allowed, row.rms)),
-            f"{100.0 * row.saturated:.2g} %",
+            f"{float(f'{100.0 * row.saturated:.2g}'):g} %",
             format_number(row.rate_hz),
         )
         for source, row in zip(result.sources, result.replays, strict=True)
