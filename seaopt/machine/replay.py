@@ -79,10 +79,10 @@ def replay(source: Source, ticks: Ticks, others: Others | None = None) -> Replay
     if lines is not None and lines.tells:
         return _describe_lines(whole, lines, ticks_per_row)
     late, causes = 0, ()
+    limited = find_saturated(ticks, whole.linear.command_limit) > 0.5  # where all laws are alike
     if not match.met:
         causes, changed = found or find_causes(whole, match, others or {})
         first = causes[0] if causes else None
-        limited = find_saturated(ticks, whole.linear.command_limit) > 0.5  # where all laws are alike
         if lines is not None and (limited or first is None or not first.explains):
             return _describe_lines(whole, lines, ticks_per_row)
         if first is not None and first.kind == "late" and first.what == "command" and first.explains:
@@ -100,7 +100,7 @@ def replay(source: Source, ticks: Ticks, others: Others | None = None) -> Replay
     if match.met and not causes and match.energy > (FLOOR * rms) ** 2:
         causes = find_hidden(whole, match, others or {})
     if match.met and not causes and match.coarse:
-        causes = (leave_open("rounding", "log", allowed),)
+        causes = (leave_open("saturated", "command") if limited else leave_open("rounding", "log", allowed),)
     met = match.met and not causes
     off = np.flatnonzero(np.abs(match.error) > SIGMAS * match.allowed)
     return Replay(

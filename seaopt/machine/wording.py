@@ -67,7 +67,8 @@ UNTOLD = {
 def _say_open(cause: Cause) -> str:
     """Return why a log does not tell which law it is of, and what would."""
     if cause.kind in OPEN:
-        return f"undecided, {EVERY_TICK}: {OPEN[cause.kind]}"
+        of = "" if cause.kind == "saturated" else f", {EVERY_TICK}"
+        return f"undecided{of}: {OPEN[cause.kind]}"
     if cause.kind == "rounding":
         value = format_number(cause.value)
         return f"undecided: rounding of the log allows {value} (rms) of the command; log it with more digits"

@@ -146,6 +146,14 @@ def test_a_log_whose_rounding_allows_much_of_the_command_is_undecided(controller
 COARSE = 100.0  # N, of a converter's counts
 
 
+def test_a_log_that_is_saturated_throughout_is_not_called_rounded(controller):
+    push, noise = np.ones(4000), np.random.default_rng(1).normal(size=4000)
+    log = so.Log.from_arrays(time=1e-3 * np.arange(4000), reference=5000.0 * push, I=9.0 * push, F1=2000.0 + noise)
+    result = so.accept(controller, [log])
+    assert [cause.kind for cause in result.replays[0].causes] == ["saturated"] and result.replays[0].undecided
+    assert "undecided: the command is at its limit in most rows" in " ".join(str(result).split())
+
+
 def test_counts_that_the_law_reads_are_not_what_a_log_is_rounded_to(controller, bench):
     log = bench.log(replace(Machine(), force_step=COARSE), REFERENCE)
     assert np.unique(log["F1"]).size < 30
