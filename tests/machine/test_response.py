@@ -392,6 +392,10 @@ def test_with_dry_friction_what_is_predicted_is_of_the_reference_that_was_played
     sliding = bench.controller.achieved
     assert abs(sliding.phase_margin_deg - rows["phase margin"].value) > 3.0
     assert "under the reference of the log, simulated" in " ".join(repr(result).split())
+    of_all = [replace(row, limit=0.9 * 30.0) if row.name == "bandwidth" else row for row in result.response.judged]
+    fast = replace(result, response=replace(result.response, judged=tuple(of_all)))  # all have what was asked
+    said = " ".join(repr(fast).split())
+    assert "that is judged is what was asked, 30 Hz: " in said and "it is not the 30 Hz" not in said
     harder = so.accept(bench.controller, [bench.log(replace(machine, coulomb=3.0 * FRICTION), reference, noise=0.5)])
     (slower,) = (row for row in harder.response.judged if row.name == "bandwidth")
     assert slower.outcome == "refuted" and slower.value < slower.limit < rows["bandwidth"].value, slower

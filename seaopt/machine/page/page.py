@@ -94,6 +94,7 @@ AS_PLAYED = (
     "The bandwidth that is judged is the least that {} have under this reference, {}: it is not the {} that was asked "
     "of the machine as it slides. Here it is {}."
 )
+AS_ASKED = "The bandwidth that is judged is what was asked, {}: {} have no less under this reference. Here it is {}."
 REACHES = ", which is what was asked"
 ALLOWED = ", which is less than was asked and no less than the {} that are allowed, with {} of grace"
 FASTER = ", {} times what was asked: nothing bounds it above, so look at Ms and Mt"
@@ -151,8 +152,12 @@ def _say_stuck(row: Judged, controller: Controller) -> str:
 def _say_as_played(row: Judged, result: Acceptance) -> str:
     """Return of which bandwidth the row is, and which one was asked."""
     asked = result.controller.spec.bandwidth_hz
-    sizes = [f"{format_number(each, 3)} Hz" for each in ((row.limit or 0.0) / (1.0 - SHORT_BY), asked)]
-    return AS_PLAYED.format(name_machines(result), *sizes, _say_reached(row, asked))
+    least = (row.limit or 0.0) / (1.0 - SHORT_BY)
+    machines, reached = name_machines(result), _say_reached(row, asked)
+    sizes = [f"{format_number(each, 3)} Hz" for each in (least, asked)]
+    if sizes[0] == sizes[1]:
+        return AS_ASKED.format(sizes[1], machines, reached)
+    return AS_PLAYED.format(machines, *sizes, reached)
 
 
 def _say_reached(row: Judged, asked: float) -> str:
