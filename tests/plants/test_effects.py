@@ -15,7 +15,7 @@ TRUTH = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 2.0, "N": 100.0, "K_t
 EFFECTS = {
     "droop": {"a_i": 0.012},
     "falling_torque": {"a_v": 0.2},
-    "friction_drift": {"w_c": 0.4, "b_t": 8e-5},
+    "friction_drift": {"w_c": 0.4, "b_t": 8e-5, "r_t": 0.9},
     "friction_direction": {"f_a": 0.006, "b_a": -4e-5},
     "back_driving": {"d_e": 0.06},
     "cogging": {"a_g": 0.01, "b_g": -0.006, "n_g": 1.4},
@@ -35,8 +35,9 @@ def _rate(t, x, p):
     motor = (
         p["K_tau"] * current * (1.0 - p.get("a_i", 0.0) * current**2) * (1.0 - p.get("a_v", 0.0) * abs(speed) / p["N"])
     )
-    dry = p["f_c"] * math.tanh(speed / p["v_s"]) * (1.0 - p.get("w_c", 0.0) * t)
-    viscous = (p["b_r"] + p.get("b_t", 0.0) * t) * speed
+    s = -math.expm1(-p["r_t"] * t) / p["r_t"] if "r_t" in p else t
+    dry = p["f_c"] * math.tanh(speed / p["v_s"]) * (1.0 - p.get("w_c", 0.0) * s)
+    viscous = (p["b_r"] + p.get("b_t", 0.0) * s) * speed
     rub = dry + viscous + p.get("f_a", 0.0) + p.get("b_a", 0.0) * abs(speed)
     phase = p.get("n_g", 0.0) * angle
     rub += p.get("a_g", 0.0) * math.sin(phase) + p.get("b_g", 0.0) * math.cos(phase)
@@ -90,13 +91,16 @@ def test_what_sticks_breaks_away_sooner_in_one_direction():
         assert bool(np.ptp(so.simulate(stuck, params, log, rtol=1e-4)["theta_m"]) > 1e-6) is moves, torque
 
 
-def test_what_sticks_breaks_away_later_as_friction_falls():
+@pytest.mark.parametrize(("rate", "expected"), [(0.0, 1.0), (1e-6, 1.0), (0.4, -math.log(1.0 - 0.4) / 0.4)])
+def test_what_sticks_breaks_away_later_as_friction_falls(rate, expected):
+    """Once f_c (1 - w_c s) is the torque: s = 1, the time where nothing settles."""
     plant, params = _make("friction_drift")
+    params = params.update(r_t=rate)
     time = np.arange(3000) / 1000
     log = so.Log.from_arrays(time=time, I=np.full(time.size, 0.012 / TRUTH["K_tau"]))
     angle = so.simulate(so.plants.let_stick(plant), params, log, rtol=1e-4)["theta_m"]
     started = time[np.flatnonzero(np.abs(angle) > 1e-6)[0]]
-    assert abs(started - (1.0 - 0.012 / 0.02) / 0.4) < 5e-3  # f_c (1 - w_c t) = torque
+    assert abs(started - expected) < 5e-3
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,10 @@ Parts of `seaopt.plants.parts`; each is nothing where its parameters are zero:
     which the actuation's effort works: behind the gear, or the nut's.
 ``friction_drift``
     Friction changes while a log is recorded, as grease warms up: after :math:`t` seconds dry friction is
-    :math:`1 - w_c t` of what it was, but never less than nothing, and damping :math:`b_t t` more. The time is an input
-    of its own, `elapsed`, which a log need not have: it is then counted from the log's beginning, and is zero wherever
-    a controller is designed, so that a fit's values are those at the beginning.
+    :math:`1 - w_c s` of what it was, but never less than nothing, and damping :math:`b_t s` more, with
+    :math:`s = (1 - e^{-r_t t}) / r_t`, which is t where r_t is zero: what warms up settles. The time is an input of its
+    own, `elapsed`, which a log need not have: it is then counted from the log's beginning, and is zero wherever a
+    controller is designed, so that a fit's values are those at the beginning.
 ``friction_direction``
     Friction differs between the two directions: :math:`f_a + b_a |v|` is added, so that dry friction is
     :math:`f_c \pm f_a` and damping :math:`b \pm b_a`.
@@ -51,6 +52,7 @@ from seaopt.units import LINEAR, ROTARY, Mechanics, mechanics_of
 
 ELAPSED = "elapsed"  # the input that is the time since a log's beginning
 AMPERE = "A"
+STRAIGHT_DRIFT = 1e-4  # of what has settled: less of it bends a drift by as little
 STRAIGHT = 1e-12  # 1/A^2: a torque constant that droops less does not droop at all
 
 
@@ -60,8 +62,9 @@ def _fall_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
 
 def _drift_parameters(effort: Mechanics) -> tuple[Parameter, ...]:
     return (
-        declare("w_c", 0.0, "1/s", -math.inf, "share of dry friction that is lost per second"),
-        declare("b_t", 0.0, effort.stiffness, -math.inf, "damping that a second adds"),
+        declare("w_c", 0.0, "1/s", -math.inf, "share of dry friction that is lost per second, at first"),
+        declare("b_t", 0.0, effort.stiffness, -math.inf, "damping that a second adds, at first"),
+        declare("r_t", 0.0, "1/s", 0.0, "rate at which the change settles"),
     )
 
 
@@ -148,14 +151,22 @@ def let_friction_drift(plant: Plant) -> Plant:
     force, jump, loads = friction.force, friction.jump, friction.loads
     refuse_clash(plant, "friction_drift", (ELAPSED,))
 
+    def settle(elapsed: Any, p: Any) -> Any:
+        settled = p.r_t * elapsed
+        straight = ca.fabs(settled) < STRAIGHT_DRIFT
+        some = ca.if_else(straight, 1.0, settled)
+        return elapsed * ca.if_else(straight, 1.0 - 0.5 * settled, (1.0 - ca.exp(-some)) / some)
+
     def fall(p: Any) -> Any:
-        return ca.fmax(1.0 - p.w_c * getattr(p, ELAPSED), 0.0)
+        return ca.fmax(1.0 - p.w_c * settle(getattr(p, ELAPSED), p), 0.0)
 
     def read_loads(x: Any, u: Any, p: Any) -> Mapping[str, Any]:
         return {**({} if loads is None else loads(x, u, p)), ELAPSED: getattr(u, ELAPSED)}
 
     def damp(x: Any, u: Any, p: Any) -> SimpleNamespace:
-        return with_values(u, {name: getattr(u, name) + p.b_t * getattr(u, ELAPSED) * friction.velocity(x, p)})
+        return with_values(
+            u, {name: getattr(u, name) + p.b_t * settle(getattr(u, ELAPSED), p) * friction.velocity(x, p)}
+        )
 
     drifting = replace(
         friction,

@@ -444,6 +444,20 @@ def test_intervals_reach_to_the_best_of_what_leaves_an_excess():
         assert low < share * TRUTH[name] < high
 
 
+def test_friction_that_settles_is_named_where_it_drifts_in_proportion_to_time():
+    """It falls as a winding warms up: where only its drift is free, the rate at which that settles is at fault."""
+    plant, log = so.plants.rotary(link="locked", parts=["friction_drift"]), record(drift=0.5, warms_s=2.0)
+    params = plant.defaults.update(**TRUTH).free("w_c", "b_t")
+    result = fit(log, plant, params=params)
+    (cause,) = (finding for finding in result.findings if finding.kind == "cause")
+    assert not result.met and cause.where == "r_t"
+    assert cause.preferred["r_t"][0] == pytest.approx(1.0 / 2.0, rel=0.02)
+    right = fit(log, plant, params=params.update(r_t=0.2).free("r_t"))
+    assert right.met
+    assert find_error({name: right.parameters[name].value for name in FREE}) < 0.01
+    assert right.parameters["r_t"].value == pytest.approx(1.0 / 2.0, rel=0.01)
+
+
 def test_what_takes_nearly_all_of_a_high_excess_is_named():
     """A spring that hardens much, on a bench that shakes a little: fitted with it, the rest asks for a second log."""
     log = record(harder=16.0)
