@@ -389,6 +389,22 @@ def test_a_column_that_is_another_but_for_a_factor_is_no_second_sensor(tmp_path,
     assert rows["LoadCell_raw"].description == "not used: 3.226 times LoadCell_N"
 
 
+@pytest.mark.parametrize("encoder_first", [False, True])
+def test_the_place_of_the_nut_is_read_where_its_column_says_so_beside_counts(tmp_path, logs, encoder_first):
+    """Both are one position: what is stated in mm needs neither the lead nor the counts of a turn."""
+    motion = logs["screw"]
+    places = {"path [mm]": 1e3 * motion["q"], "encoder": np.round(motion["q"] / 6e-7)}
+    places = dict(reversed(places.items())) if encoder_first else places
+    columns = {"t [s]": logs["t"], "I [A]": motion["I"], "force [N]": motion["F1"], **places}
+    proposal = propose([write_csv(tmp_path / "a.csv", columns)], {"actuator": "linear"}, tmp_path)
+    rows = {row.column: row for row in proposal.columns}
+    assert rows["path [mm]"].role == "q" and not rows["encoder"].role
+    assert rows["encoder"].description == "not used: path [mm] is that already"
+    (experiment,) = tomllib.loads(proposal.text)["experiment"]
+    assert experiment["outputs"]["q"] == "path [mm]"
+    assert not any("encoder" in guess for guess in tomllib.loads(proposal.text)["guessed"])
+
+
 def test_a_column_that_is_not_used_says_why(tmp_path, logs):
     free, noise = logs["free"], np.random.default_rng(1).normal(size=logs["t"].size)
     columns = {

@@ -240,9 +240,9 @@ def _free_delays(problem: FitProblem, params: ParameterSet, *, poor: bool) -> It
         words: list[str] = []
         for e, _, shift, value in trials:
             late = {o: values[f"{e.name}-{o}.delay_s"] - shift - value for o in e.outputs}
-            least = 0.3 * e.log.period
+            least, of = 0.3 * e.log.period, f" of {e.name}" if len(experiments) > 1 else ""
             words += [
-                f"{o} is {1e3 * abs(seconds):.4g} ms {'late' if seconds > 0.0 else 'early'}"
+                f"{o}{of} is {1e3 * abs(seconds):.4g} ms {'late' if seconds > 0.0 else 'early'}"
                 for o, seconds in late.items()
                 if np.ptp(list(late.values())) >= least < abs(seconds)
             ]

@@ -113,9 +113,9 @@ def _explain_unused(column: SurveyedColumn, source: str, roles: Mapping[str, Sur
         return "a speed, which a fit takes from a position"
     if header.commanded or header.quantity in ("current", "voltage", "duty"):
         return f"the input is {roles[source].name}"
-    angles = ("theta_m", "theta_l") if rotary else ("screw", "phi")
-    of_side = {"motor": angles[:1], "link": angles[1:]}.get(header.side, angles)
-    signals = {"torque": ("tau_s",)} if rotary else {"force": ("F1", "F2"), "length": ("q",) * (header.side != "link")}
+    motor, links = (("theta_m",), ("theta_l",)) if rotary else (("q", "screw"), ("phi",))
+    of_side = {"motor": motor, "link": links}.get(header.side, motor + links)
+    signals = {"torque": ("tau_s",)} if rotary else {"force": ("F1", "F2"), "length": motor * (header.side != "link")}
     places = ("deflection",) if rotary and header.deflection else of_side
     taken = [roles[role].name for role in (signals | {"angle": places}).get(header.quantity, ()) if role in roles]
     if taken:
@@ -214,11 +214,13 @@ def _place_linear(columns: list[SurveyedColumn], roles: dict[str, SurveyedColumn
             roles[left[0]] = column
             doubts[column.name] = f"the {DESCRIPTIONS[left[0]]}, {left[0]}, as its header has no number"
     for column in columns:
-        link = column.header.side == "link"
-        if column.header.quantity == "length":
-            roles.update({} if link or "q" in roles else {"q": column})
-        elif column.header.quantity == "angle":
-            roles.setdefault("phi" if link else "screw", column)
+        if column.header.quantity == "length" and column.header.side != "link" and "screw" not in roles:
+            roles.setdefault("q", column)
+    for column in columns:
+        if column.header.quantity == "angle" and column.header.side == "link":
+            roles.setdefault("phi", column)
+        elif column.header.quantity == "angle" and "q" not in roles:  # the nut's place needs no lead and no counts
+            roles.setdefault("screw", column)
     return doubts | _place_unnamed(columns, roles, ("F1", "F2"))
 
 

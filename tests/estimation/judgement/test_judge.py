@@ -92,6 +92,20 @@ def test_the_cause_of_a_spoiled_log_is_named(spoil, said):
     assert re.search(said, cause(result)), cause(result)
 
 
+def test_outputs_that_are_late_are_named_with_their_logs():
+    """Of two logs the first output is late, by another time in each."""
+    experiments = []
+    for seed, late in ((1, 2), (2, 4)):
+        columns = bench(seed, n=1500, noise_n=2.0)
+        columns = {name: c[: 1500 - late] if name == "F1" else c[late:] for name, c in columns.items()}
+        log = so.Log.from_arrays(time=np.arange(1500 - late) / RATE_HZ, **columns)
+        named = {"plant": so.plants.high_impedance(), "outputs": ("F1", "F2"), "name": f"log{seed}"}
+        experiments.append(so.Experiment(log=log, **named))
+    result = so.fit(experiments, so.plants.thor().update(J=2e-6, b_r=2.5e-4).free("J", "b_r"))
+    said = re.search(r"F1 of log1 is ([\d.]+) ms late and F1 of log2 is ([\d.]+) ms late", cause(result))
+    assert said is not None and [float(ms) for ms in said.groups()] == pytest.approx([5.0, 10.0], rel=0.01)
+
+
 def test_friction_that_the_model_lacks_is_found():
     result = fit(bench(friction_n=60.0, n=3000))
     assert not result.met
