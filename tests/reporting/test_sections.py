@@ -118,6 +118,13 @@ def test_a_new_requirement_of_a_certificate_appears_everywhere(certificate, tmp_
         assert {"invented_limit", "4.25", "3.5", "moon"} <= set(re.split(r"[<>\s:,]+", text))
 
 
+@pytest.mark.parametrize(("band", "bandwidth_hz", "swings"), [((12.8, 19.7), 19.7, False), ((1.2, 14.3), 0.84, True)])
+def test_a_reference_that_peaks_is_not_called_a_swinging_output(certificate, band, bandwidth_hz, swings):
+    change = {"tracking_band_hz": band, "bandwidth_hz": bandwidth_hz}
+    plants = {name: replace(figures, **change) for name, figures in certificate.plants.items()}
+    assert ("A swinging output puts a zero" in repr(replace(certificate, plants=plants))) is swings
+
+
 def test_terms_are_explained_under_the_pointer(fitted, certificate, tmp_path, without_drawing):
     page = so.write_report([fitted, certificate], tmp_path / "r.html").read_text(encoding="utf-8")
     explained = re.findall(r'<abbr title="([^"]+)">([^<]+)</abbr>', page)

@@ -293,9 +293,11 @@ def _tabulate_places(certificate: Certificate, schedule: ScheduledController) ->
 
 
 def _swings(certificate: Certificate) -> bool:
-    """Tell whether the -3 dB bandwidth of some plant says nothing: its tracking band does not start at 0 Hz."""
-    bands = (figures.tracking_band_hz for figures in certificate.plants.values())
-    return any(band is not None and band[0] > 1.0 for band in bands)
+    """Tell whether the -3 dB bandwidth of some plant says nothing: it has fallen before its tracking band starts. That
+    may start above 0 Hz for a peak of the reference, too.
+    """
+    bands = ((figures.tracking_band_hz, figures.bandwidth_hz) for figures in certificate.plants.values())
+    return any(band is not None and band[0] > 1.0 and (hz is None or hz < band[0]) for band, hz in bands)
 
 
 def _tabulate_margins(certificate: Certificate) -> Table:
