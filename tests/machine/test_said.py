@@ -125,3 +125,16 @@ def test_a_factor_at_the_end_of_what_is_tried_is_said_to_be_that_or_more():
     largest = Difference(value=math.exp(3.0), alike=("k", "gain"), alike_values=(math.exp(-3.0), 0.03), **made)
     assert say_difference(largest) == "b_r is 20 times its value or more (or k 0.05 or less, or gain 0.03)"
     assert say_difference(Difference(value=19.9, **made)) == "b_r is 19.9 times its value"
+
+
+@pytest.mark.parametrize("left", [1.0, 9.0])
+def test_an_interval_says_that_nothing_else_may_differ(judged, tmp_path, left):
+    """A loop 1 ms later with a fifth more friction was given as 0.936 ms (0.891 to 0.982), explained to the noise."""
+    _, result = judged
+    late = Difference(
+        kind="delay", name="delay", value=9.36e-4, low=8.91e-4, high=9.82e-4, unit="s", explains=0.995, left=left
+    )
+    differences = replace(result.differences, inside=False, found=(late,))
+    for text in read_everywhere(replace(result, differences=differences), tmp_path)[:2]:
+        assert "An interval holds where nothing but its row differs" in text
+        assert ("No row explains all of it to the noise." in text) == (left > result.differences.most_noise)

@@ -121,9 +121,10 @@ NOT_TOLD = "Rows whose shares are alike are not told apart by the log."
 TWO_AMPLITUDES = (
     "A limit of the drive and a smaller gain are told apart by a log at half the amplitude: a gain stays as it is."
 )
-IN_PART = (
-    "No row explains all of it to the noise. An interval holds where nothing but its row differs; the true size may be "
-    "outside."
+IN_PART = "No row explains all of it to the noise."
+NOTHING_ELSE = (
+    "An interval holds where nothing but its row differs: beside a difference that noise hides, or that the row takes "
+    "up, the true size may be outside."
 )
 BEGINS = (
     "Of {} the first {} are left out: in them the filter of the outer loop's velocity forgets what was before the log, "
@@ -337,8 +338,8 @@ def _remark(differences: Differences) -> tuple[str, ...]:
         remarks.append(NOT_TOLD)
         if any(each.kind == "drive limit" for each in differences.found):
             remarks.append(TWO_AMPLITUDES)
-    if not differences.explained:
-        remarks.append(IN_PART)
+    remarks += [] if differences.explained else [IN_PART]
+    remarks += [NOTHING_ELSE] if any(each.low is not None for each in differences.found) else []
     return tuple(remarks)
 
 
