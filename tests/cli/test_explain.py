@@ -82,6 +82,8 @@ def test_a_fit_may_leave_the_search_for_causes_out(problem, seaopt):
     assert result.returncode == 1
     said = " ".join(result.stdout.split())
     assert said.count("may lack was not looked for") == 1 and "causes were not looked for" not in said
+    assert "next: look for causes, without --no-causes and causes = false: type seaopt fit" in said
+    assert "correct the file" not in said  # nothing in it is wrong
     fit = json.loads((out / "fit.json").read_text(encoding="utf-8"))
     kinds = {finding["kind"] for finding in fit["findings"]}
     assert "unsearched" in kinds and "excess" in kinds and not kinds & {"cause", "fixed", "budget"}

@@ -38,7 +38,9 @@ def judge(fit: Fit, commands: Commands) -> Verdict:
     if fit.status != "converged" and not _repeats(fit):
         errors.insert(0, (fit.message, ""))
     reasons = tuple(_group(errors))
-    again = [Step.typed("correct the file, then", commands.fit)] if commands.fit else []
+    unsearched = any(each.kind == "unsearched" for each in fit.errors)
+    first = "look for causes, without --no-causes and causes = false:" if unsearched else "correct the file, then"
+    again = [Step.typed(first, commands.fit)] if commands.fit else []
     return Verdict(
         met=False,
         text=f"Fit: {status}{size}, {format_count(len(reasons), 'reason')} why it is not met{_name_silent(fit)}"
