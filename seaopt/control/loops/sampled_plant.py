@@ -438,13 +438,13 @@ def hold(
     Imaginary parts come through as derivatives do: with 1e-20 of a direction added as one, those of the result are
     1e-20 of its derivative (complex step).
     """
-    whole_period, gamma = _exponential(a, b, np.full(delay_s.size, sample_time_s))
+    whole_period, gamma = exponentiate(a, b, np.full(delay_s.size, sample_time_s))
     if not np.any(delay_s):
         return whole_period, gamma, c, d
     whole = np.floor(np.real(delay_s) / sample_time_s + 1e-9).astype(int)
     remainder = delay_s - whole * sample_time_s
     remainder = remainder - np.minimum(np.real(remainder), 0.0)
-    newer = _exponential(a, b, sample_time_s - remainder)[1]
+    newer = exponentiate(a, b, sample_time_s - remainder)[1]
     count, n, chain = a.shape[0], a.shape[1], int(whole.max()) + 1
     rows = np.arange(count)
     drive = np.zeros((count, n, chain + 1), dtype=newer.dtype)  # column i: the command i samples ago
@@ -463,7 +463,7 @@ def hold(
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a plant far off may overflow: the loop is then not stable
-def _exponential(a: Matrices, b: Vectors, t: Inexact[np.ndarray, " k"]) -> tuple[Matrices, Vectors]:
+def exponentiate(a: Matrices, b: Vectors, t: Inexact[np.ndarray, " k"]) -> tuple[Matrices, Vectors]:
     """Return exp(a t) and the integral of exp(a s) b from 0 to t: Taylor's polynomial, scaled and squared."""
     # scipy.linalg.expm keeps complex steps too, but takes stacks one matrix at a time: 27 times as long at 1375 draws.
     n = a.shape[1]

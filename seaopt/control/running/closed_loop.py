@@ -33,9 +33,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import expm
 
-from seaopt.control.loops.sampled_plant import find_delay, read_conditions, whole_samples
+from seaopt.control.loops.sampled_plant import exponentiate, find_delay, read_conditions, whole_samples
 from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, channel_names
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
@@ -55,10 +54,10 @@ MAX_LOOP_SUBSTEPS = 512
 ALIKE = 0.5  # of its largest value, by which a state of a run that is lost may differ between two numbers of steps
 FASTEST_GUESSED = 1e6  # of a mode, radians a sample: beyond, the guess is the largest, and a power may overflow
 RTOL, STICKING_RTOL = 1e-6, 1e-4
-# A state below that share of the largest, or of what a sample without friction makes of it, is at rest: but for
-# rounding; but for a step's own error where a joint sticks, which lets it creep while the command changes in a sample.
+# A state below that share of the largest, or of what a sample makes of it without friction, is at rest but for
+# rounding. Where a joint sticks it creeps by a step's own error besides, while the command changes within a sample.
 RESTS, STICKING_RESTS = 1e-10, 1.0
-DOUBLINGS = 7  # of the time in which that is looked for: to 64 samples
+SAMPLES_MOVED = 2.0 ** np.arange(7)  # over which it is looked for what a sample makes of a state
 
 
 @record(eq=False)
@@ -198,16 +197,15 @@ def run_loop(
     # Friction that sticks has no slope at rest.
     matrices = state_space(friction_states(loop.plant)[SLIDING] if loop.sticks else loop.plant, values[0])
     substeps, before, wall_s = _first_guess(matrices[0], loop.law.sample_time_s, rtol), None, 0.0
-    motion = _bound_motion(matrices[0], matrices[1][:, 0], loop.law.sample_time_s)
     pushes = [_push_at_start(loop.plant, each, job.start.x[run]) for run, each in enumerate(values)]
-    unheld = np.stack([_bound_motion(matrices[0], push, loop.law.sample_time_s) for push in pushes])
+    moved = _bound_motion(matrices[0], np.stack([matrices[1][:, 0], *pushes]), loop.law.sample_time_s)
     execute = make_kernel(loop, job)
     while True:
         begin = time.perf_counter()
         arrays = execute(job, substeps)
         wall_s += time.perf_counter() - begin
         kept = _first_lost_sample(arrays) == n
-        errors = _errors(arrays, motion, unheld, sticks=loop.sticks) / (1.0 if loop.sticks else 15.0)
+        errors = _errors(arrays, moved[0], moved[1:], sticks=loop.sticks) / (1.0 if loop.sticks else 15.0)
         error = float(np.max(errors[kept], initial=0.0))
         shortest = 2 * substeps > MAX_LOOP_SUBSTEPS
         decided = bool(np.all(kept)) or (
@@ -357,17 +355,15 @@ def _push_at_start(plant: Plant, params: CompletedParameters, x: Float[np.ndarra
 
 
 def _bound_motion(
-    a: Float[np.ndarray, "nx nx"], b: Float[np.ndarray, " nx"], period: float
-) -> Float[np.ndarray, " nx"]:
-    """Return about how far rates b move each state in a sample: the most that they do in 1, 2, 4, ... samples, over the
-    square of their number, since what only a spring moves has hardly begun to in the first.
+    a: Float[np.ndarray, "nx nx"], rates: Float[np.ndarray, "k nx"], period: float
+) -> Float[np.ndarray, "k nx"]:
+    """Return about how far each of k rates moves each state in a sample: the most that they do in 1, 2, 4, ... samples,
+    over the square of their number, since what only a spring moves has hardly begun to in the first.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        whole = period * np.block([[a, b[:, None]], [np.zeros((1, len(b) + 1))]])
-        if not np.all(np.isfinite(whole)):  # a plant beyond computing has no motion to measure by
-            return np.zeros_like(b)
-        whole, motion = expm(whole), np.zeros_like(b)
-        for doubling in range(DOUBLINGS):
-            motion = np.fmax(motion, np.abs(whole[:-1, -1]) / 4.0**doubling)
-            whole = whole @ whole
-    return np.nan_to_num(motion, posinf=0.0)
+    k, spans = len(rates), SAMPLES_MOVED.size
+    stacked = np.broadcast_to(a, (k * spans, *a.shape)), np.repeat(rates, spans, axis=0)
+    _, moved = exponentiate(*stacked, np.tile(period * SAMPLES_MOVED, k))
+    with np.errstate(invalid="ignore"):
+        shares = np.abs(moved.reshape(k, spans, -1)) / SAMPLES_MOVED[:, None] ** 2
+    # A plant beyond computing has no motion to measure by.
+    return np.max(np.nan_to_num(shares, posinf=0.0), axis=1)
