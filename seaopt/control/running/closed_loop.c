@@ -7,9 +7,11 @@
 #include <string.h>
 
 typedef struct {
-    long n, substeps;          /* samples; steps of the coarse solution in a sample, the fine one takes twice as many */
+    long n, substeps, finest;  /* samples; steps of the coarse solution in a sample, the fine one takes twice as many;
+                                  those of the coarse one up to which both are doubled where they differ by more than most */
     double t0, period, late_s; /* after late_s of a sample the current `late` follows that of u */
     const double *p, *c, *lag; /* parameters, the law's numbers, which of the commands are in force */
+    const double *most;        /* NX */
     const double *r, *w, *e;   /* n, n x NW, n x NE */
     double *x, *z;             /* in and out */
     double *peak, *error, *size; /* NY, NX, NX: largest |y| over all fine steps, |fine - coarse| and |x| */
@@ -41,10 +43,16 @@ static void integrate(const seaopt_loop_args *a, double t, const double *u, cons
     piece(a, t + a->late_s, a->period - a->late_s, newer, steps, x, peak);
 }
 
+static int agree(const seaopt_loop_args *a, const double *fine, const double *coarse) {
+    for (int i = 0; i < NX; i++)
+        if (!(fabs(fine[i] - coarse[i]) <= a->most[i])) return 0;
+    return 1;
+}
+
 static inline double larger(double old, double value) { return value > old || value != value ? value : old; }
 
 static void run(const seaopt_loop_args *a) {
-    double x[NX], z[NZ + 1], after[NZ + 1], u[NU], newer[NU], coarse[NX], unused[NY], work[SZ_W + 1];
+    double x[NX], z[NZ + 1], after[NZ + 1], u[NU], newer[NU], coarse[NX], fine[NX], top[NY], work[SZ_W + 1];
     const double *arg[SZ_ARG + 9];
     double *res[SZ_RES + 4];
     casadi_int iw[SZ_IW + 1];
@@ -63,10 +71,18 @@ static void run(const seaopt_loop_args *a) {
         a->applied[k] = newer[0];
         for (int i = 0; i < NY; i++) a->peak[i] = larger(a->peak[i], fabs(a->y[k * NY + i]));
         if (lost) continue;
-        memcpy(coarse, x, sizeof x);
-        memcpy(unused, a->peak, sizeof unused);
-        integrate(a, t, u, newer, a->substeps, coarse, unused);
-        integrate(a, t, u, newer, 2 * a->substeps, x, a->peak);
+        memcpy(fine, x, sizeof x);
+        memcpy(top, a->peak, sizeof top);
+        integrate(a, t, u, newer, a->substeps, fine, top);
+        for (long steps = a->substeps; steps <= a->finest; steps *= 2) {
+            memcpy(coarse, fine, sizeof fine);
+            memcpy(fine, x, sizeof x);
+            memcpy(top, a->peak, sizeof top);
+            integrate(a, t, u, newer, 2 * steps, fine, top);
+            if (agree(a, fine, coarse)) break;
+        }
+        memcpy(x, fine, sizeof x);
+        memcpy(a->peak, top, sizeof top);
         for (int i = 0; i < NX; i++) {
             a->error[i] = larger(a->error[i], fabs(x[i] - coarse[i]));
             a->size[i] = larger(a->size[i], fabs(x[i]));

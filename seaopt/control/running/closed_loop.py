@@ -15,7 +15,8 @@ leaves what floats can hold has no error to look at: it is taken for the loop's 
 long for the plant, where half as long ones lose it in the same sample or the next, after states as large.
 
 With friction that sticks the steps are those of `seaopt.simulation.sticking`, whose error where a joint stops is of a
-lower order: the difference itself is the estimate, and the steps are halved until it is below `STICKING_RTOL`.
+lower order: the difference itself is the estimate, and the steps are halved until it is below `STICKING_RTOL`; in the
+samples alone that need it, which are those where a joint stops or starts.
 
 Peaks are of every fine step, not of the samples alone: a mode at 160 Hz has six samples a period at 1 kHz, whose
 largest can be 13 % below the top.
@@ -35,7 +36,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from seaopt.control.loops.sampled_plant import exponentiate, find_delay, read_conditions, whole_samples
-from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, make_kernel
+from seaopt.control.running.loop_kernel import Job, LoopArrays, Rows, Steps, make_kernel
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, at_rest, channel_names
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.errors import SimulationError, StepSizeError, require_seed, suggestion
@@ -53,7 +54,8 @@ __all__ = ["ENERGY", "LoopRun", "LoopState", "SampledLoop", "at_rest", "run_loop
 MAX_LOOP_SUBSTEPS = 512
 ALIKE = 0.5  # of its largest value, by which a state of a run that is lost may differ between two numbers of steps
 FASTEST_GUESSED = 1e6  # of a mode, radians a sample: beyond, the guess is the largest, and a power may overflow
-RTOL, STICKING_RTOL = 1e-6, 1e-4
+RTOL, STICKING_RTOL = 1e-6, 3e-5
+ALLOWED = 0.1  # of that, in samples that have steps of their own: what a held joint creeps in each adds up
 # A state below that share of the largest, or of what a sample makes of it without friction, is at rest but for
 # rounding. Where a joint sticks it creeps by a step's own error besides, while the command changes within a sample.
 RESTS, STICKING_RESTS = 1e-10, 1.0
@@ -73,7 +75,7 @@ class LoopRun:
     peaks: Mapping[str, Float[np.ndarray, " runs"]]  # largest magnitude of each output over all integration steps
     end: LoopState  # one sample after the last
     error: float  # estimated integration error of the worst sample, over the state's largest value
-    substeps: int  # integration steps per sample
+    substeps: int  # integration steps per sample; friction that sticks takes more where a joint stops or starts
     wall_s: float  # time the simulation took, with steps that were too long, but not compilation
     command: tuple[str, str] = ("I", "A")
 
@@ -196,53 +198,63 @@ def run_loop(
         rtol = STICKING_RTOL if loop.sticks else RTOL
     # Friction that sticks has no slope at rest.
     matrices = state_space(friction_states(loop.plant)[SLIDING] if loop.sticks else loop.plant, values[0])
-    substeps, before, wall_s = _first_guess(matrices[0], loop.law.sample_time_s, rtol), None, 0.0
+    guess, before, wall_s = _first_guess(matrices[0], loop.law.sample_time_s, rtol), None, 0.0
     pushes = [_push_at_start(loop.plant, each, job.start.x[run]) for run, each in enumerate(values)]
     moved = _bound_motion(matrices[0], np.stack([matrices[1][:, 0], *pushes]), loop.law.sample_time_s)
     execute = make_kernel(loop, job)
+    steps = Steps(coarse=guess, finest=guess, most=np.full_like(job.start.x, math.inf))
     while True:
         begin = time.perf_counter()
-        arrays = execute(job, substeps)
+        arrays = execute(job, steps)
         wall_s += time.perf_counter() - begin
         kept = _first_lost_sample(arrays) == n
-        errors = _errors(arrays, moved[0], moved[1:], sticks=loop.sticks) / (1.0 if loop.sticks else 15.0)
+        sizes = _sizes(arrays, moved[0], moved[1:], sticks=loop.sticks)
+        with np.errstate(invalid="ignore"):
+            errors = np.nan_to_num(arrays.error / sizes, nan=np.inf) / (1.0 if loop.sticks else 15.0)
         error = float(np.max(errors[kept], initial=0.0))
-        shortest = 2 * substeps > MAX_LOOP_SUBSTEPS
+        shortest = 2 * steps.coarse > MAX_LOOP_SUBSTEPS or not (steps.even or np.all(arrays.error <= steps.most))
         decided = bool(np.all(kept)) or (
             before is not None and bool(np.all(kept | _lose_alike(before, arrays, shortest=shortest)))
         )
         if error <= rtol and decided:
-            return _result(loop, job, arrays, error, substeps, wall_s)
+            return _result(loop, job, arrays, error, 2 * steps.coarse, wall_s)
         if shortest:
+            tried = f"plant {loop.plant.name}: {2 * steps.finest} steps per sample"
             if decided:
                 worst, state = np.unravel_index(np.argmax(np.where(kept[:, None], errors, 0.0)), errors.shape)
                 raise StepSizeError(
-                    f"plant {loop.plant.name}: {2 * substeps} steps per sample leave an error of {error:.1e} of the "
-                    f"state {list(loop.plant.states)[state]} (rtol = {rtol:g}); check the parameters, smooth the "
-                    "friction (v_s), or raise rtol",
+                    f"{tried} leave an error of {error:.1e} of the state {list(loop.plant.states)[state]} "
+                    f"(rtol = {rtol:g}); check the parameters, smooth the friction (v_s), or raise rtol",
                     run=int(worst),
                 )
             raise SimulationError(
-                f"plant {loop.plant.name}: {2 * substeps} steps per sample do not decide whether the loop runs away or "
-                "the steps are too long; check the parameters",
+                f"{tried} do not decide whether the loop runs away or the steps are too long; check the parameters",
                 run=int(np.argmin(kept)),
             )
-        substeps, before = 2 * substeps, arrays
+        before, steps = arrays, _shorten(steps, rtol * sizes if loop.sticks and np.all(kept) else None)
 
 
-def _errors(
+def _shorten(steps: Steps, allowed: Rows | None) -> Steps:
+    """Return the steps to try next: half as long; where errors are `allowed`, in the samples alone that exceed them."""
+    if allowed is None:
+        return Steps(coarse=2 * steps.coarse, finest=2 * steps.coarse, most=np.full_like(steps.most, math.inf))
+    coarse = steps.coarse if steps.even else 2 * steps.coarse
+    halvings = (MAX_LOOP_SUBSTEPS // coarse).bit_length() - 1
+    return Steps(coarse=coarse, finest=coarse * 2**halvings, most=ALLOWED * allowed)
+
+
+def _sizes(
     arrays: LoopArrays, motion: Float[np.ndarray, " nx"], unheld: Float[np.ndarray, "runs nx"], *, sticks: bool
 ) -> Float[np.ndarray, "runs nx"]:
-    """Return the largest differences of two numbers of steps in a sample, over the state's largest value. A state that
-    rests, or that friction holds, has rounding for a value: it is measured by the largest of the others, by `motion`,
-    what an ampere would make of it in a sample without friction, and by `unheld`, what the first sample would without.
+    """Return what an error in a sample is measured by: the state's largest value. A state that rests, or that friction
+    holds, has rounding for a value: it is measured by the largest of the others, by `motion`, what an ampere would make
+    of it in a sample without friction, and by `unheld`, what the first sample would without.
     """
     free = motion * np.max(np.abs(arrays.applied), axis=1, keepdims=True, initial=0.0) + unheld
     with np.errstate(invalid="ignore"):
         resting = RESTS * np.max(arrays.size, axis=1, keepdims=True)
         size = np.maximum(np.maximum(arrays.size, resting), (STICKING_RESTS if sticks else RESTS) * free)
-        scale = np.where(size > 0.0, size, 1.0)
-        return np.nan_to_num(arrays.error / scale, nan=np.inf)
+    return np.where(size > 0.0, size, 1.0)
 
 
 def _first_lost_sample(arrays: LoopArrays) -> Int[np.ndarray, " runs"]:

@@ -61,6 +61,22 @@ class Job:
 
 
 @record(eq=False)
+class Steps:
+    """Integration steps of a sample: `coarse` and twice as many. Both are doubled in a sample whose two ends differ by
+    more than `most`, while the coarse ones are at most `finest`.
+    """
+
+    coarse: int
+    finest: int
+    most: Float[np.ndarray, "runs nx"]
+
+    @property
+    def even(self) -> bool:
+        """Whether every sample takes the same number."""
+        return self.finest == self.coarse
+
+
+@record(eq=False)
 class LoopArrays:
     """What a kernel leaves behind: arrays of one row per run."""
 
@@ -211,7 +227,7 @@ def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Any, Kernel | Non
     return sample, advance, load_kernel(_source(plant, structure, sample, advance), "seaopt_loops")
 
 
-def make_kernel(loop: SampledLoop, job: Job) -> Callable[[Job, int], LoopArrays]:
+def make_kernel(loop: SampledLoop, job: Job) -> Callable[[Job, Steps], LoopArrays]:
     """Return what runs a job: compiled code or, without a compiler, CasADi's virtual machine."""
     native, constants = _kernel(loop.plant, _structure_of(loop, job))[2], _constants(loop)
     if native is None:
@@ -246,11 +262,12 @@ def _allocate(loop: SampledLoop, job: Job) -> LoopArrays:
 
 
 _CARRIED = ("x", "z", "peak", "error", "size")  # from sample to sample
-_POINTERS = ("p", "c", "lag", "r", "w", "e", "x", "z", "peak", "error", "size", "y", "applied", "states")
+_POINTERS = ("p", "c", "lag", "most", "r", "w", "e", "x", "z", "peak", "error", "size", "y", "applied", "states")
 _ARGUMENTS = np.dtype(
     [
         ("n", np.int64),
         ("substeps", np.int64),
+        ("finest", np.int64),
         ("t0", float),
         ("period", float),
         ("late_s", float),
@@ -259,33 +276,34 @@ _ARGUMENTS = np.dtype(
 )
 
 
-def _run_compiled(loop: SampledLoop, c: Float[np.ndarray, " m"], native: Kernel, job: Job, substeps: int) -> LoopArrays:
+def _run_compiled(loop: SampledLoop, c: Float[np.ndarray, " m"], native: Kernel, job: Job, steps: Steps) -> LoopArrays:
     arrays = _allocate(loop, job)
     runs, n = job.reference.shape
     arguments = np.zeros(runs, dtype=_ARGUMENTS)
-    arguments["n"], arguments["substeps"] = n, substeps
+    arguments["n"], arguments["substeps"], arguments["finest"] = n, steps.coarse, steps.finest
     arguments["t0"], arguments["period"] = job.start_s, loop.law.sample_time_s
     arguments["late_s"] = job.late_s
     results = {field.name: getattr(arrays, field.name) for field in fields(arrays)}
-    rows = {"p": job.p, "lag": job.lag, "r": job.reference, "w": job.noise, **results}
+    rows = {"p": job.p, "lag": job.lag, "most": steps.most, "r": job.reference, "w": job.noise, **results}
     for name, array in rows.items():
         arguments[name] = row_addresses(array)
     arguments["c"], arguments["e"] = c.ctypes.data, job.external.ctypes.data
-    native.run(arguments, (job, c, arrays))
+    native.run(arguments, (job, c, steps, arrays))
     return arrays
 
 
-def _run_interpreted(loop: SampledLoop, c: Float[np.ndarray, " m"], job: Job, substeps: int) -> LoopArrays:
+def _run_interpreted(loop: SampledLoop, c: Float[np.ndarray, " m"], job: Job, steps: Steps) -> LoopArrays:
     """Run in CasADi's virtual machine: the same two functions, chained in a third."""
     arrays = _allocate(loop, job)
     runs, n = job.reference.shape
     chunk = min(n, CHAINED_SAMPLES)
     split = bool(np.any(job.late_s))
-    chain = _chain(loop.plant, _structure_of(loop, job), loop.law.sample_time_s, substeps, chunk, split)
+    structure = _structure_of(loop, job)
+    chain = _chain(loop.plant, structure, loop.law.sample_time_s, steps.coarse, steps.finest, chunk, split)
     times = job.start_s + loop.law.sample_time_s * np.arange(n)
     for run in range(runs):
         state = np.concatenate([getattr(arrays, name)[run] for name in _CARRIED])
-        constants = (job.p[run], c, job.lag[run], job.late_s[run : run + 1])
+        constants = (job.p[run], c, job.lag[run], job.late_s[run : run + 1], steps.most[run])
         shared = [np.repeat(constant[:, None], chunk, axis=1) for constant in constants]
         signals = (times[None], job.external.T, job.reference[run, None], job.noise[run].T)
         for first in range(0, n, chunk):
@@ -302,36 +320,70 @@ def _run_interpreted(loop: SampledLoop, c: Float[np.ndarray, " m"], job: Job, su
 
 
 @memo
-def _chain(plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, chunk: int, split: bool) -> Any:
+def _chain(
+    plant: Plant, structure: _Structure, sample_time_s: float, coarse: int, finest: int, chunk: int, split: bool
+) -> Any:
     """Return `_period_function` of `chunk` samples in a row."""
-    period = _period_function(plant, structure, sample_time_s, substeps, split)
-    return (period.expand() if substeps <= MAX_EXPANDED_STEPS else period).mapaccum(chunk)
+    period = _period_function(plant, structure, sample_time_s, coarse, finest, split)
+    return (period.expand() if coarse == finest <= MAX_EXPANDED_STEPS else period).mapaccum(chunk)
 
 
-def _period_function(plant: Plant, structure: _Structure, sample_time_s: float, substeps: int, split: bool) -> Any:
-    """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s) -> (the same a sample later, y, current, x)."""
-    sample, advance, _ = _kernel(plant, structure)
+def _period_function(
+    plant: Plant, structure: _Structure, sample_time_s: float, coarse: int, finest: int, split: bool
+) -> Any:
+    """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s, most) -> (the same a sample later, y, current,
+    x).
+    """
+    sample, _, _ = _kernel(plant, structure)
     sizes = [len(plant.states), structure.law.kept + structure.waiting, len(channel_names(plant))]
     state = ca.MX.sym("state", sizes[0] * 3 + sizes[1] + sizes[2])
     t, r, late_s = (ca.MX.sym(name) for name in ("t", "r", "late_s"))
     e, w, p, c, lag = (
         ca.MX.sym(name, sample.numel_in(i)) for name, i in (("e", 3), ("w", 5), ("p", 6), ("c", 7), ("lag", 8))
     )
+    most = ca.MX.sym("most", sizes[0])
     x, z, peak, error, size = ca.vertsplit(state, np.cumsum([0, *sizes, sizes[0], sizes[0]]).tolist())
     after, u, late, y = sample(t, x, z, e, r, w, p, c, lag)
-    newer = ca.vertcat(late, e)
-    pieces = [(u, t, late_s), (newer, t + late_s, sample_time_s - late_s)] if split else [(newer, t, sample_time_s)]
     top = ca.fmax(peak, ca.fabs(y))
-    ends: list[tuple[Any, Any]] = []
-    for steps in (substeps, 2 * substeps):
-        at, highest = x, top
-        for number, (command, begin, lasting) in enumerate(pieces):
-            h = lasting / steps
-            if number:  # an output that the command reaches at once
-                _, highest = advance(begin, at, highest, command, p, INSTANT * sample_time_s)
-            for i in range(steps):
-                at, highest = advance(begin + i * h, at, highest, command, p, h)
-        ends.append((at, highest))
-    (coarse, _), (fine, top) = ends
-    grown = ca.vertcat(fine, after, top, ca.fmax(error, ca.fabs(fine - coarse)), ca.fmax(size, ca.fabs(fine)))
-    return ca.Function("seaopt_period", [state, t, e, r, w, p, c, lag, late_s], [grown, y, late, x])
+    between = partial(_between_samples, plant, structure, sample_time_s, split=split)
+    arguments = [x, top, u, ca.vertcat(late, e), t, late_s, p]
+    refine: ca.Function | None = None
+    for halvings in reversed(range((finest // coarse).bit_length())):
+        refine = _refine_function(between(coarse * 2 ** (halvings + 1)), refine)
+    assert refine is not None
+    fine, top, moved = refine(*arguments, most, between(coarse)(*arguments)[0])
+    grown = ca.vertcat(fine, after, top, ca.fmax(error, moved), ca.fmax(size, ca.fabs(fine)))
+    return ca.Function("seaopt_period", [state, t, e, r, w, p, c, lag, late_s, most], [grown, y, late, x])
+
+
+def _between_samples(plant: Plant, structure: _Structure, sample_time_s: float, steps: int, *, split: bool) -> Any:
+    """Return the CasADi function (x, peak, u, newer, t, late_s, p) -> (x+, peak+): a sample in so many steps."""
+    advance = _kernel(plant, structure)[1]
+    x, peak, u, p = (ca.MX.sym(name, advance.numel_in(i)) for name, i in (("x", 1), ("peak", 2), ("u", 3), ("p", 4)))
+    newer, t, late_s = ca.MX.sym("newer", u.numel()), ca.MX.sym("t"), ca.MX.sym("late_s")
+    pieces = [(u, t, late_s), (newer, t + late_s, sample_time_s - late_s)] if split else [(newer, t, sample_time_s)]
+    at, highest = x, peak
+    for number, (command, begin, lasting) in enumerate(pieces):
+        h = lasting / steps
+        if number:  # an output that the command reaches at once
+            _, highest = advance(begin, at, highest, command, p, INSTANT * sample_time_s)
+        for i in range(steps):
+            at, highest = advance(begin + i * h, at, highest, command, p, h)
+    return ca.Function("between", [x, peak, u, newer, t, late_s, p], [at, highest])
+
+
+def _refine_function(fine: ca.Function, finer: ca.Function | None) -> Any:
+    """Return the CasADi function (..., most, coarse) -> (x+, peak+, |x+ - coarse|): a sample in the steps of `fine`
+    or, where their end is further than `most` from that of coarser ones, in those of `finer`.
+    """
+    numbers = [ca.MX.sym(fine.name_in(i), fine.numel_in(i)) for i in range(fine.n_in())]
+    most, coarse = (ca.MX.sym(name, fine.numel_in(0)) for name in ("most", "coarse"))
+    x, peak = fine(*numbers)
+    ends = [x, peak, ca.fabs(x - coarse)]
+    if finer is not None:
+        kept = [ca.MX.sym(name, end.numel()) for name, end in zip(("x", "peak", "moved"), ends, strict=True)]
+        keep = ca.Function("keep", [*numbers, most, *kept], kept)
+        further = ca.Function("further", [*numbers, most, *kept], list(finer(*numbers, most, kept[0])))
+        disagree = ca.sum1(ca.logic_not(ends[2] <= most))  # of NaN, too
+        ends = list(ca.Function.if_else("choose", further, keep)(disagree, *numbers, most, *ends))
+    return ca.Function("refine", [*numbers, most, coarse], ends)

@@ -345,3 +345,60 @@ def test_a_motor_that_friction_holds_while_its_current_rises_stands_still():
     assert 0.0 < pushed < 0.05
     assert np.max(np.abs(run.states[..., list(plant.states).index("theta_m")])) < 1e-3 * 0.5 * pushed / 1e-4 * TS**2
     assert run.substeps < 50
+
+
+def _slipping(rtol):
+    """Run 0.4 s of a joint that stands still for a quarter of the time and slips in between."""
+    plant = so.plants.rotary(link="locked", parts=("current_loop",))
+    params = plant.defaults.update(current_loop_hz=100.0, f_c=0.05, K_tau=0.06)
+    controller = so.tune(plant, params, so.ControllerSpec(measured="tau_s", bandwidth_hz=20, max_sensitivity=1.7))
+    loop = SampledLoop(plant=plant, law=runnable(controller), measured="tau_s", delay_samples=1, sticks=True)
+    return run_loop(loop, [params], 2.0 * np.sin(2 * np.pi * 5 * TS * np.arange(400)), rtol=rtol)
+
+
+def _time_stepping(current, h):
+    """Return [theta_m, thetad_m, I] at the samples by Moreau's steps, of order one: a force of at most f_c in each."""
+    inertia, damping, constant, ratio, stiffness, friction, fade = (
+        1e-4,
+        1e-4,
+        0.06,
+        50.0,
+        300.0,
+        0.05,
+        2 * np.pi * 100.0,
+    )
+    angle = speed = amperes = 0.0
+    rows = []
+    for command in current:
+        rows.append((angle, speed, amperes))
+        for _ in range(round(TS / h)):
+            after = command + (amperes - command) * np.exp(-fade * h)
+            push = constant * 0.5 * (amperes + after) - stiffness * angle / ratio**2 - damping * speed
+            free = speed + h / inertia * push
+            then = np.sign(free) * max(abs(free) - h * friction / inertia, 0.0)
+            angle += h * 0.5 * (speed + then) if then * speed > 0.0 else h * then
+            speed, amperes = then, after
+    return np.array(rows)
+
+
+def test_short_steps_where_a_joint_slips_alone_are_as_right_as_short_ones_everywhere():
+    run = _slipping(1e-6)
+    assert run.substeps < 50  # in every sample it takes 96
+    assert 0.1 < np.mean(np.abs(run.states[0, :, 1]) < 1e-6) < 0.5
+    coarse, fine = (_time_stepping(run.current[0], h) for h in (1e-5, 2e-6))
+    size = np.max(np.abs(run.states[0]), axis=0)
+    np.testing.assert_allclose(run.states[0] / size, (5.0 * fine - coarse) / 4.0 / size, atol=1e-5)
+
+
+def test_the_interpreter_takes_short_steps_in_the_same_samples(monkeypatch):
+    if native.find_compiler() is None:
+        pytest.skip("no compiler here")
+    compiled = _slipping(1e-6)
+    monkeypatch.setenv("SEAOPT_COMPILER", "none")
+    native.load_library.cache_clear()
+    interpreted = _slipping(1e-6)
+    native.load_library.cache_clear()
+    np.testing.assert_allclose(
+        interpreted.states, compiled.states, rtol=0.0, atol=1e-12 * np.max(np.abs(compiled.states))
+    )
+    assert interpreted.error == pytest.approx(compiled.error, rel=1e-6)

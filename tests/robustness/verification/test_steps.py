@@ -50,7 +50,7 @@ def certificate(blind, stand, rubbing):
 def play_independently(controller, params, steps, jump=False):
     mass = Mass.of({name: params[name].value for name in params}, jump=jump)
     reference = np.repeat(np.array(steps)[:, None], 300, axis=1)
-    return simulate([mass] * len(steps), [controller.to_dict()] * len(steps), reference, substeps=20)
+    return simulate([mass] * len(steps), [controller.to_dict()] * len(steps), reference, substeps=40 if jump else 20)
 
 
 def test_steps_overshoot_as_the_independent_simulator_says(blind, certificate, rubbing):
