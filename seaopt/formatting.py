@@ -10,7 +10,7 @@ import html
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -32,6 +32,11 @@ def format_figure(value: Any, unit: str = "", digits: int = 4, missing: str = MI
     """Return a number with its unit."""
     number = format_number(value, digits, missing)
     return number if number == missing else f"{number} {unit}".rstrip()
+
+
+def format_percent(share: float, digits: int = 3, sign: Literal["", "+"] = "") -> str:
+    """Return a share in percent, rounded to so many digits and never as a power of ten: "100 %", not "1e+02 %"."""
+    return f"{float(f'{100.0 * share:.{digits}g}'):{sign}.12g} %"
 
 
 def printable(text: str) -> str:

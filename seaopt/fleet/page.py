@@ -18,7 +18,7 @@ from seaopt.fleet.population import Population
 from seaopt.fleet.result import Fleet
 from seaopt.fleet.scatter import BETWEEN_HEAD
 from seaopt.fleet.worker import FAILED, MET, NOT_MET
-from seaopt.formatting import MISSING, format_count, format_number, join_words
+from seaopt.formatting import MISSING, format_count, format_number, format_percent, join_words
 from seaopt.reporting.page.fleet import ActuatorTable, Cell, Row, draw_trend, write_page
 from seaopt.reporting.sections.data import (
     Commands,
@@ -132,9 +132,9 @@ def _describe_drift(drift: Drift) -> list[Section]:
     texts = [
         f"Each actuator has a chart of {join_words(list(drift.between))} (CUSUM of innovations, k = {ALLOWANCE:g}, h = "
         f"{drift.threshold:.2f}). It adds up how far each run lies from the mean of those before it, in standard "
-        f"deviations of its fit and between runs. The threshold is set so that at most {100 * drift.false_alarms:g} % "
-        f"of healthy actuators raise an alarm within {PER_RUNS} runs. Of the {drift.actuators} here: "
-        f"{drift.describe_expected()}.",
+        "deviations of its fit and between runs. The threshold is set so that at most "
+        f"{format_percent(drift.false_alarms)} of healthy actuators raise an alarm within {PER_RUNS} runs. Of the "
+        f"{drift.actuators} here: {drift.describe_expected()}.",
         f"Time: {drift.history.source}.{warning}",
     ]
     if drift.left_out:
@@ -306,7 +306,7 @@ def _show_parameter(
     change, change_std = row.get(f"{name}_change"), row.get(f"{name}_change_std")
     trend = ""
     if value and change is not None and change_std is not None and math.isfinite(change):
-        trend = f"{100 * change / value:+.2g} % ± {format_number(abs(100 * change_std / value), 2)}"
+        trend = f"{format_percent(change / value, 2, '+')} ± {format_number(abs(100 * change_std / value), 2)}"
     cell = Cell(text=text, sort=_show(value, text).sort, trend=trend)
     if runs is None:
         return cell

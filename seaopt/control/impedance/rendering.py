@@ -23,7 +23,7 @@ from seaopt.control.loops.loop import GROWING
 from seaopt.control.loops.outer_loop import Impedance, OuterLoop
 from seaopt.control.loops.port import hold_response
 from seaopt.errors import ControlError, require_type
-from seaopt.formatting import html_text
+from seaopt.formatting import format_percent, html_text
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -128,7 +128,7 @@ class Rendering:
         if not self.stable:
             lines.append("UNSTABLE with nothing at the link")
         else:
-            lines.append(f"a step of the link overshoots by {100 * self.overshoot:.3g} %")
+            lines.append(f"a step of the link overshoots by {format_percent(self.overshoot)}")
         if self.band_hz is not None:
             lines.append(f"within 3 dB of what was asked from {self.band_hz[0]:.3g} to {self.band_hz[1]:.3g} Hz")
         return lines

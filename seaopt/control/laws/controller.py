@@ -33,6 +33,7 @@ from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant, list_names, sample
 from seaopt.control.loops.transfer_function import TransferFunction
 from seaopt.estimation import warn_unidentified
+from seaopt.formatting import format_percent
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -422,7 +423,8 @@ class Controller(ClosesLoops, Result, Worded):
         if not np.isfinite(loop.plant.static_gain) or left < NOT_ARRIVED:
             return ()
         return (
-            f"a step of the reference is still {100 * left:.2g} % off after {seconds:.2g} s, {ARRIVAL_PERIODS:.0f} "
+            f"a step of the reference is still {format_percent(left, 2)} off after {seconds:.2g} s, "
+            f"{ARRIVAL_PERIODS:.0f} "
             'periods of the bandwidth: the integral is slow, and slower with friction; give objective = "disturbance"',
         )
 

@@ -44,7 +44,7 @@ from seaopt.control.loops.compensation.terms import Compensation
 from seaopt.control.loops.outer_loop import OuterLoop
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.errors import ControlError, require_number
-from seaopt.formatting import join_words
+from seaopt.formatting import format_percent, join_words
 from seaopt.options import check_options, option
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
@@ -156,7 +156,7 @@ class Agreement:
 
     def describe(self, unit: str) -> str:
         """Return how far a reading may be from what."""
-        share = f"{100.0 * self.share:.2g} %"
+        share = format_percent(self.share, 2)
         return f"{self.limit:.4g} {unit} and {share} of what the spring carries by {join_words(self.reads)}"
 
     @classmethod
@@ -213,8 +213,8 @@ class Agreement:
             share, latest = share + max(parts), latest + max(late)
         if share >= MOST_SHARE:
             raise ControlError(
-                f"agreement: the std of the spring is {100.0 * share / SIGMAS:.2g} % of it, with which hardly anything "
-                "disagrees; fit its stiffness, or give it a smaller prior_std"
+                f"agreement: the std of the spring is {format_percent(share / SIGMAS, 2)} of it, with which hardly "
+                "anything disagrees; fit its stiffness, or give it a smaller prior_std"
             )
         spread = math.hypot(noise[regulated], *((1.0 + share) * weights * [noise[name] for name in names]))
         limit = SIGMAS * spread + zero + latest * rate

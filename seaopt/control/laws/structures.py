@@ -84,6 +84,7 @@ from seaopt.control.loops.law import Law
 from seaopt.control.loops.loop import Loop
 from seaopt.control.loops.sampled_plant import DigitalPlant
 from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
+from seaopt.formatting import format_percent
 from seaopt.options import option
 from seaopt.records import record
 
@@ -241,8 +242,8 @@ class DisturbanceObserver:
             return ()
         return (
             f"the disturbance observer does next to nothing: Q is 3 dB down at {self.bandwidth_hz:.3g} Hz, and from "
-            f"{OBJECTIVE_HZ:g} to {0.1 * bandwidth_hz:.3g} Hz it takes at most {100 * max(share, 0.0):.2g} % off what "
-            'the gains alone leave of a disturbance; structure = "pid" does as well',
+            f"{OBJECTIVE_HZ:g} to {0.1 * bandwidth_hz:.3g} Hz it takes at most {format_percent(max(share, 0.0), 2)} "
+            'off what the gains alone leave of a disturbance; structure = "pid" does as well',
         )
 
     def filters(self, sample_time_s: float) -> tuple[TransferFunction, TransferFunction]:

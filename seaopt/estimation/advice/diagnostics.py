@@ -31,6 +31,7 @@ from seaopt.estimation.result.findings import FitFinding
 from seaopt.estimation.result.fit_result import Fit
 from seaopt.estimation.result.summary import describe_outputs
 from seaopt.estimation.uncertainty.leverage import PRIORS, Leverage, measure_leverage
+from seaopt.formatting import format_percent
 from seaopt.records import PlotAccessor, Result, Worded, record
 
 SIGNIFICANCE = 0.01  # a test that fails with less than this probability by chance is reported
@@ -247,7 +248,7 @@ def _advise_on_colour(output: FitOutput, row: OutputDiagnostics, predicts: bool)
 def _advise_on_leverage(leverage: Mapping[str, Leverage]) -> list[str]:
     """Return which experiment adds nothing, and which parameters are known from their priors alone."""
     useless = [
-        f"{name} brings {100 * source.whole:.2g} % of the information: it could be left out"
+        f"{name} brings {format_percent(source.whole, 2)} of the information: it could be left out"
         for name, source in leverage.items()
         if name != PRIORS and len(leverage) > 1 and source.whole < LITTLE
     ]

@@ -49,7 +49,7 @@ from seaopt.estimation.solver.settle import (
     sharpen,
 )
 from seaopt.estimation.solver.step_shares import copy_steps
-from seaopt.formatting import join_words
+from seaopt.formatting import format_percent, join_words
 from seaopt.parameters import QUANTILE
 from seaopt.plants import Plant
 from seaopt.progress import Progress, ignore
@@ -372,7 +372,7 @@ def _weigh(
         inside = inside and away <= half
         if away > max(MOVED_STDS * (old.std or 0.0), half, MOVED_SHARE * abs(old.value)):
             moved.append((away / max(abs(old.value), 1e-300), name))
-    effects = [f"takes {100.0 * (1.0 - left):.3g} % of a residual's power away"] if left < 1.0 - 1e-3 else []
+    effects = [f"takes {format_percent(1.0 - left)} of a residual's power away"] if left < 1.0 - 1e-3 else []
     if moved:
         _, name = max(moved)
         effects.append(f"moves {name} from {fit.parameters[name].value:.4g} to {values[name]:.4g}")

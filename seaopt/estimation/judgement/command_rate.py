@@ -51,6 +51,7 @@ from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import find_blocked
 from seaopt.estimation.solver.settle import measure_misfit, settle_roughly
 from seaopt.estimation.solver.step_shares import copy_steps
+from seaopt.formatting import format_percent
 from seaopt.records import record
 from seaopt.signals import weigh_points
 
@@ -147,7 +148,7 @@ def _fill_rows(fit: Fit, minimum: Minimum, floors: Mapping[str, NoiseFloor], fir
         float(np.min((best.power[e.name].rms / np.maximum(fitted.power[e.name].rms, 1e-300)) ** 2))
         for e in problem.experiments
     )
-    seen = f"with the values between interpolated {100.0 * gone:.3g} % of a residual's power is gone"
+    seen = f"with the values between interpolated {format_percent(gone)} of a residual's power is gone"
     certain = nearer > ENOUGH
     if not certain:
         seen += ", and as much with inputs that are stamped late"
@@ -274,7 +275,7 @@ def _find_white(experiment: Experiment, octaves: Iterable[Octave]) -> FitFinding
     share = float(np.average(shares, weights=[octave.lines for octave in told]))
     low, high = min(o.band_hz[0] for o in told), max(o.band_hz[1] for o in told)
     seen = (
-        f"alike at all frequencies from {low:.3g} to {high:.3g} Hz, {100.0 * share:.2g} % of the outputs' power "
+        f"alike at all frequencies from {low:.3g} to {high:.3g} Hz, {format_percent(share, 2)} of the outputs' power "
         "follows no row of it, as if a random force as large acted on the motor"
     )
     return _state(experiment, max(round(1.0 / (1.0 - share)), 2), seen)

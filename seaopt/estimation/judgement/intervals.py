@@ -27,6 +27,7 @@ from seaopt.estimation.result.model_error import ModelError
 from seaopt.estimation.solver.least_squares import minimise
 from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.estimation.solver.step_size import STEP_ERROR_PARAMETER, STEP_ERROR_SIGMA
+from seaopt.formatting import format_percent
 from seaopt.logs.quality.faults import find_quantisation
 from seaopt.parameters import QUANTILE, Parameter
 from seaopt.plants.friction import list_smoothing
@@ -113,7 +114,7 @@ def find_rough(fit: Fit, error: ModelError) -> Iterator[FitFinding]:
             severity="warning" if name in effects else "error",
             kind="rough",
             where=name,
-            text=f"known only roughly, no better than to {100.0 * ROUGH:.2g} %: excite it more, measure another "
+            text=f"known only roughly, no better than to {format_percent(ROUGH, 2)}: excite it more, measure another "
             "output, or fix it, or give it a prior, at what is known of it from elsewhere",
         )
 
@@ -189,7 +190,7 @@ def find_wrong_starts(fit: Fit) -> Iterator[FitFinding]:
             kind="initial",
             where=name,
             text="does not begin at rest, or in the state that initial_state states: with that free, "
-            f"{100.0 * gone:.3g} % of a residual's power is gone{moves}; leave it free, with initial_state = "
+            f"{format_percent(gone)} of a residual's power is gone{moves}; leave it free, with initial_state = "
             '"estimate", or cut the log to where it rests, with slice_s',
             proposal='[[experiment]]\ninitial_state = "estimate"',
             python='so.Experiment(..., initial_state="estimate")',
@@ -228,8 +229,8 @@ def find_step_error(fit: Fit) -> Iterator[FitFinding]:
             severity="warning",
             kind="step",
             where="",
-            text=f"the finest integration steps leave an error of {100.0 * output:.2g} % of a sensor's noise, which "
-            f"moves values by up to {moved:.2g} of their std; up to {100.0 * STEP_ERROR_SIGMA:.2g} % and "
+            text=f"the finest integration steps leave an error of {format_percent(output, 2)} of a sensor's noise, "
+            f"which moves values by up to {moved:.2g} of their std; up to {format_percent(STEP_ERROR_SIGMA, 2)} and "
             f"{STEP_ERROR_PARAMETER:.2g} are meant to be left",
         )
 

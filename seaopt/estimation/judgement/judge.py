@@ -57,7 +57,7 @@ from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.estimation.result.widening import widen
 from seaopt.estimation.solver.budget import EVALUATIONS, EvaluationBudget
 from seaopt.estimation.solver.least_squares import find_blocked
-from seaopt.formatting import join_words
+from seaopt.formatting import format_percent, join_words
 from seaopt.parameters import Parameter
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, ignore
@@ -379,8 +379,8 @@ def _find_unexplained(
         ratio = explained / max(explainable, 1e-300)
         if ratio < MOST and explainable > LITTLE:
             text = (
-                f"the model explains {100 * explained:.3g} % of its energy, and the inputs account for "
-                f"{100 * explainable:.3g} %"
+                f"the model explains {format_percent(explained)} of its energy, and the inputs account for "
+                f"{format_percent(explainable)}"
             )
             yield _warn("explained", where, text, bad=ratio < HALF)
         elif share.p < CHANCE and share.residual > 0.0 and share.power > SMALL:
@@ -388,8 +388,8 @@ def _find_unexplained(
             follows = math.sqrt(share.residual) * excess[where]
             bad = where not in told and any(follows > least and share.power > power for least, power in SYSTEMATIC)
             text = (
-                f"{100 * share.residual:.2g} % of the residual's power follows the inputs, most of all at {band} Hz, "
-                f"{follows:.2g} times its sensor's noise: the model lacks something"
+                f"{format_percent(share.residual, 2)} of the residual's power follows the inputs, most of all at "
+                f"{band} Hz, {follows:.2g} times its sensor's noise: the model lacks something"
             )
             yield _warn("residual", where, text, bad=bad)
 
@@ -425,9 +425,9 @@ def _find_held_out(fit: Fit, holdout: float) -> Iterator[FitFinding]:
         worse = (1.0 - held_out) / max(1.0 - used, 1e-300)
         if worse >= WORSE_HELD_OUT**2 and held_out <= 0.99 * used and not _leaves_noise(e, y, fitted, holdout):
             text = (
-                f"{100 * used:.4g} % is explained of the samples used and {100 * held_out:.4g} % of those held out: "
-                "the plant changed, is excited elsewhere, or the fit follows what does not repeat; log longer, or fix "
-                "parameters"
+                f"{format_percent(used, 4)} is explained of the samples used and {format_percent(held_out, 4)} of "
+                "those held out: the plant changed, is excited elsewhere, or the fit follows what does not repeat; "
+                "log longer, or fix parameters"
             )
             yield _warn("held_out", f"{e.name}.{y}", text, bad=held_out < HELD_OUT * used)
 

@@ -18,7 +18,7 @@ from seaopt.codec import OrInfinite
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.normal_equations import RANK, eliminate
 from seaopt.estimation.problem.shapes import Matrix, ParameterVector, Vector
-from seaopt.formatting import join_words
+from seaopt.formatting import format_percent, join_words
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters
 from seaopt.records import record
@@ -149,7 +149,7 @@ def describe_direction(direction: dict[str, float], alone_seen: bool) -> str:
     weights = list(direction.values())
     if min(weights) > 0.99 * max(weights) > 0.0:
         return f"{join_words(names)} are known only in their ratios: all of them times one factor change no output"
-    changes = ", ".join(f"{name} {100 * direction[name]:+.3g} %" for name in names)
+    changes = ", ".join(f"{name} {format_percent(direction[name], 3, '+')}" for name in names)
     return f"{join_words(names)} enter only together: {changes} change no output"
 
 

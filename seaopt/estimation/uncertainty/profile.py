@@ -27,7 +27,7 @@ from seaopt.estimation.problem.shapes import Matrix, Vector
 from seaopt.estimation.result.covariance import compute_bread
 from seaopt.estimation.result.fit_result import Fit, Minimum
 from seaopt.estimation.solver.least_squares import minimise
-from seaopt.formatting import html_text
+from seaopt.formatting import format_percent, html_text
 from seaopt.records import record
 from seaopt.signals import weigh_points
 from seaopt.units import unit_after
@@ -96,8 +96,8 @@ class Profile:
         low, high = self.interval
         ends = [f"{end:.6g}" + ("" if shut else " (open)") for end, shut in zip((low, high), self.closed, strict=True)]
         lines = [
-            f"Profile of {self.name}: {self.estimate:.6g}{unit_after(self.unit)}, {100 * self.level:g} % interval "
-            f"{ends[0]} to {ends[1]}",
+            f"Profile of {self.name}: {self.estimate:.6g}{unit_after(self.unit)}, {format_percent(self.level, 6)} "
+            f"interval {ends[0]} to {ends[1]}",
             f"  from the std alone: {self.wald[0]:.6g} to {self.wald[1]:.6g}",
             f"  {self.refits} refits; the cost's rise is divided by {self.scale:.3g} for the residuals' colour",
         ]

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
-from seaopt.formatting import format_count
+from seaopt.formatting import format_count, format_percent
 from seaopt.logs.log.log import Log
 from seaopt.logs.quality import faults
 from seaopt.signals import VectorN
@@ -42,10 +42,8 @@ def _mask(log: Log, name: str, rows: Bool[np.ndarray, " n"], reason: str, remedy
     if not count:
         return log
     signal = log.signal(name)
-    note = (
-        f"{name}: {format_count(count, 'sample')} ({100 * count / len(log):.2g} %) {reason} {signal.unit}".rstrip()
-        + f" masked{remedy}"
-    )
+    amount = f"{format_count(count, 'sample')} ({format_percent(count / len(log), 2)})"
+    note = f"{name}: {amount} {reason} {signal.unit}".rstrip() + f" masked{remedy}"
     signals = {**log.signals, name: replace(signal, values=np.where(rows, np.nan, signal.values))}
     return replace(log, signals=signals, notes=(*log.notes, note))
 

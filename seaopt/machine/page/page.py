@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from seaopt.control import Controller
-from seaopt.formatting import format_count, format_number, join_words
+from seaopt.formatting import format_count, format_number, format_percent, join_words
 from seaopt.machine.acceptance import Acceptance
 from seaopt.machine.differences.certified import Differences
 from seaopt.machine.differences.comparison import TOLERATED
@@ -170,7 +170,7 @@ def _say_reached(row: Judged, asked: float) -> str:
     if value > (1.0 + SHORT_BY) * asked:
         return said + FASTER.format(format_number(value / asked, 2))
     less = row.high is not None and row.high < asked
-    return said + (ALLOWED.format(f"{format_number(allowed, 3)} Hz", f"{100.0 * SHORT_BY:g} %") if less else REACHES)
+    return said + (ALLOWED.format(f"{format_number(allowed, 3)} Hz", format_percent(SHORT_BY)) if less else REACHES)
 
 
 def _say_no_margin(row: Judged, response: Response) -> str:
@@ -214,7 +214,7 @@ def _describe_response(result: Acceptance, response: Response) -> Section:
     head = ("figure", "verdict", "limit", "measured", "interval", "predicted", "at (Hz)", NEEDED)
     aside = ", ".join(_say_extent(part) for part in response.measured)
     remarks = [
-        f"Each statement holds with a probability of {100.0 * response.confidence:g} %. Limits are those of the "
+        f"Each statement holds with a probability of {format_percent(response.confidence, 6)}. Limits are those of the "
         "specification with 5 % of grace, of the bandwidth 10 %. "
         "Nothing is said between the lines and beyond them.",
         STABILITY,
@@ -305,7 +305,7 @@ def _describe_differences(result: Acceptance, differences: Differences) -> Secti
         (
             say_difference(each),
             _show_ranges(each),
-            f"{100.0 * each.explains:.3g} %",
+            format_percent(each.explains),
         )
         for each in differences.found
     )
@@ -352,7 +352,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
             Mark(text="undecided", style="warning") if row.undecided else mark_met(row.met),
             str(row.ticks),
             *(format_number(value, 3) for value in (row.mismatch, row.largest, row.allowed, row.rms)),
-            f"{float(f'{100.0 * row.saturated:.2g}'):g} %",
+            format_percent(row.saturated, 2),
             format_number(row.rate_hz),
         )
         for source, row in zip(result.sources, result.replays, strict=True)
@@ -422,7 +422,7 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         table = tuple(
             (
                 AND * cause.besides + say(cause),
-                f"{100.0 * cause.removes:.4g} %",
+                format_percent(cause.removes, 4),
                 mark_met(cause.explains, "all", "in part"),
             )
             for cause in row.causes[: 0 if row.undecided else MOST_CAUSES]

@@ -11,6 +11,7 @@ from seaopt.control.laws.limits import BY_REQUIREMENT
 from seaopt.control.loops.port import hold_response, port_of
 from seaopt.control.running.fed_back import close_whole
 from seaopt.errors import ControlError
+from seaopt.formatting import format_percent
 from seaopt.plants.friction import take_sliding
 from seaopt.reporting.figures.loop import LOWEST_HZ, Plants, design_of, list_frequencies
 from seaopt.reporting.figures.panel import (
@@ -82,7 +83,7 @@ def requirements_panel(certificate: Certificate) -> Panel:
         rows=labels,
         heights=(max(0.35 + 0.12 * len(labels), 0.6),),
         caption="For each requirement, the plant, draw or run that uses most of its limit. Beyond 100 % it is not met; "
-        f"what uses more than {100 * MOST_USED:g} % is drawn there.",
+        f"what uses more than {format_percent(MOST_USED)} is drawn there.",
         left=NAMES_LEFT,
     )
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Literal
 
-from seaopt.formatting import MISSING, format_number
+from seaopt.formatting import MISSING, format_number, format_percent
 from seaopt.records import record
 
 LEAST_GRACE = 0.005  # that is said
@@ -32,7 +32,7 @@ def mark_met(met: bool, yes: str = "met", no: str = "not met") -> Mark:
 
 def show_limit(sense: str, limit: float | None, grace: float) -> str:
     """Return a limit as a cell, with the share by which it may be missed where that shows in its figure."""
-    return f"{sense} {format_number(limit)}" + (f" ({100.0 * grace:g} % grace)" if grace > LEAST_GRACE else "")
+    return f"{sense} {format_number(limit)}" + (f" ({format_percent(grace, 6)} grace)" if grace > LEAST_GRACE else "")
 
 
 @record

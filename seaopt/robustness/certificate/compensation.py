@@ -34,6 +34,7 @@ from seaopt.control.loops.sampled_plant import find_rest
 from seaopt.control.systems.block import EFFORT, REFERENCE, add_up, name_readings
 from seaopt.errors import ControlError
 from seaopt.executors import Shared
+from seaopt.formatting import format_percent
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import output_function
@@ -288,7 +289,7 @@ def eigenvalue_requirements(
     """Return that neither a weight nor a ripple compensated makes a loop grow, at nominal values and over draws."""
     terms, cases = controller.compensation, list[tuple[str, str, EigenvalueCase, str]]()
     if terms is not None and terms.gravity is not None:
-        compensated = f"with {100.0 * terms.gravity.fraction:.3g} % of the weight compensated"
+        compensated = f"with {format_percent(terms.gravity.fraction)} of the weight compensated"
         for name, case in gravity.items():
             port = models[name].port
             unit = "" if port is None else models[name].states[str(port.coordinate)]

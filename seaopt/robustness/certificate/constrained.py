@@ -30,7 +30,7 @@ from seaopt.control.loops.sampled_plant import DELAYS, conditions
 from seaopt.control.mpc.compiled import PlanSample
 from seaopt.errors import SeaoptError
 from seaopt.executors import Shared, map_ordered
-from seaopt.formatting import format_count
+from seaopt.formatting import format_count, format_percent
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.plant import deflection_row
@@ -141,9 +141,9 @@ class ConstrainedRuns(Result):
         failures, runs = format_count(self.failures, "failure"), format_count(self.runs, "simulated run")
         return (
             f"with limits active: {failures} in {runs}{f' ({counts})' if counts else ''}, failure probability below "
-            f"{self.failure_probability_bound:.2g} at a confidence of {100 * self.confidence:.6g} %; the command at a "
-            f"limit in {self.at_limit:.0%} of the samples, no new plan in {self.fallback:.2%}, {self.iterations} "
-            f"iterations at most{ring}"
+            f"{self.failure_probability_bound:.2g} at a confidence of {format_percent(self.confidence, 6)}; the "
+            f"command at a limit in {self.at_limit:.0%} of the samples, no new plan in {self.fallback:.2%}, "
+            f"{self.iterations} iterations at most{ring}"
         )
 
     @property

@@ -21,7 +21,7 @@ from seaopt.control.running.fed_back import close_whole, feeds_back
 from seaopt.control.scheduling.tuning import find_response_place
 from seaopt.errors import ControlError
 from seaopt.estimation import Experiment, Fit
-from seaopt.formatting import format_band
+from seaopt.formatting import format_band, format_percent
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -185,8 +185,8 @@ def describe_agreement(agreement: Agreement) -> str:
     if not agreement.contradicts:
         return "agrees with the model"
     return (
-        f"contradicts the model: its response is off by {100 * agreement.off:.2g} % at {agreement.off_hz:.3g} Hz, "
-        "which noise and the fit's intervals do not explain"
+        f"contradicts the model: its response is off by {format_percent(agreement.off, 2)} at "
+        f"{agreement.off_hz:.3g} Hz, which noise and the fit's intervals do not explain"
     )
 
 
@@ -194,7 +194,7 @@ def describe_log(log: LogVerdict) -> str:
     """Return what a log says of the loop, up to which frequency and how surely, for its row."""
     measured = "UNSTABLE" if np.isinf(log.ms) else f"Ms {log.ms:.3g}"
     alone = f", at its amplitude of {log.amplitude:.3g} {log.unit} rms alone" if log.at_amplitude else ""
-    sure = "not independent" if log.confidence is None else f"at {100 * log.confidence:g} %"
+    sure = "not independent" if log.confidence is None else f"at {format_percent(log.confidence, 6)}"
     if log.outcome == "undecided" and log.asked_hz is not None:
         sure = f"not confirmed {sure}, which asks for all from {format_band(log.asked_hz)} Hz"
     return (
@@ -255,7 +255,7 @@ def measured_requirements(
     """Return the limits of a scope on a measured response, of every response in the discs."""
     plant = controller.spec.see_response(measured, controller.command)
     figures = DiscLoop(plant=plant, law=controller.law).figures(controller.spec.bandwidth_hz)
-    on = f"on measured points, at {100 * measured.confidence:.4g} %"
+    on = f"on measured points, at {format_percent(measured.confidence, 4)}"
     if scope == "every plant":
         rows = plant_requirements(controller, Spot(name), figures)
     else:
@@ -302,7 +302,7 @@ def _remark_amplitude(cases: Cases, plant: Plant) -> tuple[str, ...]:
     low, high = STEP_SHARES[0], STEP_SHARES[-1]
     bands = predict_bandwidths(controller, plant, nominal, holding * np.geomspace(low, high, AMPLITUDES))
     reached = [band for band in bands if band is not None]
-    at = f"at {100 * low:g} to {100 * high:g} % of the current"
+    at = f"at {100.0 * low:g} to {format_percent(high)} of the current"
     if not reached:
         return (f"{name}: bandwidth {sliding:.3g} Hz sliding; below {sliding / SLOWEST_STUCK:.2g} Hz {at}",)
     least = f"{min(reached):.3g}" if len(reached) == len(bands) else f"less than {min(reached):.3g}"

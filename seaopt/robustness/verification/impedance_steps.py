@@ -16,6 +16,7 @@ from seaopt.codec import OrInfinite, OrNaN
 from seaopt.control import Controller
 from seaopt.control.impedance.link import find_link
 from seaopt.control.impedance.moving_loop import close_link
+from seaopt.formatting import format_percent
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, find_dry_friction
@@ -55,9 +56,9 @@ class ImpedanceStep:
             return f"a simulated step of {self.size:.3g} {unit} runs away"
         limit = ", at the command's limit" if self.saturated else ""
         what = (
-            f"ends at {100 * self.end:.3g} % of it and overshoots by {100 * self.overshoot:.3g} %"
+            f"ends at {format_percent(self.end)} of it and overshoots by {format_percent(self.overshoot)}"
             if self.rests
-            else f"goes on moving by {100 * self.moving:.3g} % of it, peak to peak"
+            else f"goes on moving by {format_percent(self.moving)} of it, peak to peak"
         )
         return f"a simulated step of {self.size:.3g} {unit} {what}{limit}"
 

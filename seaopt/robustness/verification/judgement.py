@@ -40,7 +40,7 @@ from jaxtyping import Float
 from seaopt.codec import Key, OrInfinite, OrNaN
 from seaopt.control.running.closed_loop import ENERGY
 from seaopt.control.running.sampled_loop import largest_command
-from seaopt.formatting import format_values
+from seaopt.formatting import format_percent, format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import find_locked_modes
 from seaopt.records import Result, record
@@ -444,7 +444,7 @@ def _judge_step(run: _TraceRun, most_s: float, judge: Judge, unlimited: Playback
     if allowed is not None and largest > allowed and unlimited is not None:
         judge.figures["overshoot_by_limit"] = replace(run, trace=unlimited).largest <= allowed
     if allowed is not None and not judge.figures.get("overshoot_by_limit"):
-        over, most = (f"{100.0 * (share - 1.0):.3g} %" for share in (largest, allowed))
+        over, most = (format_percent(share - 1.0) for share in (largest, allowed))
         remedy = SLOWER_INTEGRAL if run.scenario.friction == "sticking" else ""
         text = f"{step} overshoots by {over}, {most} are allowed"
         judge.require("overshoot", largest, allowed, text, remedy=remedy)

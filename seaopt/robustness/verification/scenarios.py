@@ -18,6 +18,7 @@ from seaopt.control.running.closed_loop import SampledLoop, at_rest, run_loop
 from seaopt.control.running.sampled_loop import find_longest_delay
 from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.errors import ControlError, suggestion
+from seaopt.formatting import format_percent
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_hold, can_stick, find_breakaway, find_dry_friction, take_sliding
@@ -332,7 +333,7 @@ def _size_steps(controller: Controller) -> dict[str, float]:
     """Return the forces (N) of steps by name."""
     limit, holding = find_step_limit(controller), controller.force_limit(0.0)
     if limit is not None and holding is not None:
-        shares = {f"{100 * share:g} % step": share * holding for share in STEP_SHARES}
+        shares = {f"{format_percent(share)} step": share * holding for share in STEP_SHARES}
         return shares | {WITHIN_LIMIT: UNSATURATED * limit}
     plant, params = _require_design(controller)
     friction = sum(find_dry_friction(plant, plant.complete(params)).values())

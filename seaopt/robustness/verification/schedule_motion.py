@@ -30,6 +30,7 @@ from seaopt.codec import OrInfinite
 from seaopt.control.running.closed_loop import LoopRun
 from seaopt.control.scheduling.scheduled_controller import ScheduledController
 from seaopt.errors import SimulationError
+from seaopt.formatting import format_percent
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.records import record
@@ -149,9 +150,9 @@ def move_schedule(
         max(SETTLED, *(2.0 * each for each in values)) for values in zip((0.0, 0.0), *standing, strict=True)
     )
     judge = Judge()
-    rings = f"rings: {100 * ringing:.3g} % of a push at its end, {100 * most_ringing:.3g} % allowed"
+    rings = f"rings: {format_percent(ringing)} of a push at its end, {format_percent(most_ringing)} allowed"
     judge.require("ringing", ringing, most_ringing, rings)
-    off = f"departs: a push is still {100 * left:.3g} % off at its end, {100 * most:.3g} % allowed"
+    off = f"departs: a push is still {format_percent(left)} off at its end, {format_percent(most)} allowed"
     judge.require("settling", left, most, off)
     return Motion(
         plant=name,

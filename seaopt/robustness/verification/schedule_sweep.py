@@ -41,6 +41,7 @@ from seaopt.control.scheduling.runnable_schedule import RunnableSchedule
 from seaopt.control.scheduling.scheduled_controller import ScheduledController, place_variable
 from seaopt.errors import SimulationError
 from seaopt.executors import Shared, map_ordered
+from seaopt.formatting import format_percent
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.memo import memo
@@ -216,7 +217,7 @@ def _run_sweep(
     judge.require("limit", saturated, 0.0, "the motion takes the command to its limit")
     reached = f"a step reaches {peak:.3g} of its size, {pulses.allowed_peak:.3g} allowed"
     judge.require("overshoot", peak, pulses.allowed_peak, reached)
-    off = f"a step is still {100 * left:.3g} % off at its end, {100 * pulses.allowed_left:.3g} % allowed"
+    off = f"a step is still {format_percent(left)} off at its end, {format_percent(pulses.allowed_left)} allowed"
     judge.require("settling", left, pulses.allowed_left, off)
     return make_sweep(peak=peak, left=left, fault=judge.first)
 

@@ -56,6 +56,7 @@ from seaopt.control.loops.port import port_of
 from seaopt.control.loops.sampled_plant import linearise_sets
 from seaopt.control.loops.transfer_function import Frequencies, Response, TransferFunction
 from seaopt.errors import ControlError
+from seaopt.formatting import format_percent
 from seaopt.options import option
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -142,7 +143,8 @@ class LinkEffect:
         the one that loses most of the band.
         """
         what = "noise gain" if self.objective == "noise" else "integral of abs(S)"
-        text = f"the {what} is {100 * abs(self.cost):.2g} % {'larger' if self.cost > 0 else 'smaller'} than without it"
+        change = "larger" if self.cost > 0 else "smaller"
+        text = f"the {what} is {format_percent(abs(self.cost), 2)} {change} than without it"
         if not self.bands:
             return text
         first, least = self.bands[0], min(self.bands, key=lambda band: band.octaves_won)
@@ -212,7 +214,8 @@ class LinkPath:
         low = f"from {self.high_pass_hz:.3g} " if self.high_pass_hz else ""
         text = (
             f"link feedforward of {self.measured} [{self.unit}], {low}to {self.corner_hz:.3g} Hz: "
-            f"{100 * self.fraction:.3g} % of {self.inertia:.4g} times {per[0]} and {self.damping:.4g} times {per[1]}"
+            f"{format_percent(self.fraction)} of {self.inertia:.4g} times {per[0]} "
+            f"and {self.damping:.4g} times {per[1]}"
         )
         if noise_gain is None:
             return text

@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from seaopt.codec import Constraints
 from seaopt.errors import ControlError, require_number
+from seaopt.formatting import format_percent
 from seaopt.options import check_options, option
 from seaopt.records import record
 
@@ -152,7 +153,7 @@ class RippleTerm:
             f"{size:.3g} at {cycles}" for cycles, size in zip(self.cycles, np.hypot(self.cos, self.sin), strict=True)
         )
         return (
-            f"{100.0 * self.fraction:.3g} % of the ripple over {self.reads}, {sizes} cycles per revolution "
+            f"{format_percent(self.fraction)} of the ripple over {self.reads}, {sizes} cycles per revolution "
             f"({self.period:.6g} {self.unit}), {effort_unit}"
         )
 

@@ -32,6 +32,7 @@ from numpy.polynomial.chebyshev import chebder, chebval
 from seaopt.codec import Constraints, to_content
 from seaopt.control.loops.compensation.ripple_term import RippleTerm, sum_ripple
 from seaopt.errors import ControlError
+from seaopt.formatting import format_percent
 from seaopt.options import check_options, option
 from seaopt.records import record
 
@@ -137,7 +138,7 @@ class GravityTerm:
         """Return what it does in words."""
         largest = max(abs(self.effort(self.low)), abs(self.effort(self.high)), abs(self.effort(0.5 * self.high)))
         return (
-            f"{100.0 * self.fraction:.3g} % of the link's weight, by {self.reads} from {self.low:.3g} to "
+            f"{format_percent(self.fraction)} of the link's weight, by {self.reads} from {self.low:.3g} to "
             f"{self.high:.3g} {self.unit}, of the order of {largest:.3g} {effort_unit}"
         )
 
@@ -171,7 +172,7 @@ class FrictionTerm:
         """Return what it does in words."""
         whence = "the reference's rate" if self.source == "reference" else f"the speed of {self.reads}"
         return (
-            f"{100.0 * self.fraction:.3g} % of Coulomb friction, {self.effort:.4g} {effort_unit} at the spring, from "
+            f"{format_percent(self.fraction)} of Coulomb friction, {self.effort:.4g} {effort_unit} at the spring, from "
             f"{whence}, at full size from {self.speed:.3g} {self.speed_unit}"
         )
 

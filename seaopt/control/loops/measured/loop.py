@@ -38,7 +38,7 @@ from seaopt.control.loops.measured.plant import ASSUMED, MeasuredPlant
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.control.loops.transfer_function import Frequencies, Response
 from seaopt.control.systems.crossings import count_turns, find_crossings
-from seaopt.formatting import format_number
+from seaopt.formatting import format_number, format_percent
 from seaopt.records import record
 
 POINTS_BETWEEN = 4  # of the grid between two measured frequencies
@@ -264,7 +264,8 @@ class MeasuredFigures:
     def __str__(self) -> str:
         low, high = (format_number(f, 3) for f in self.band_hz)
         head = (
-            f"{self.name}: on {self.points} measured points from {low} to {high} Hz, at {100 * self.confidence:.4g} %"
+            f"{self.name}: on {self.points} measured points from {low} to {high} Hz, "
+            f"at {format_percent(self.confidence, 4)}"
         )
         if not self.stable:
             return f"{head}, not shown to be stable"

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from seaopt.estimation import Fit
 from seaopt.estimation.result.findings import DerivedFigure
 from seaopt.estimation.result.trials import spell_parameters, spell_parts
-from seaopt.formatting import MISSING, format_count, format_number, join_words
+from seaopt.formatting import MISSING, format_count, format_number, format_percent, join_words
 from seaopt.parameters import Parameter
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Step, Table, Verdict, list_notes
 from seaopt.units import unit_after
@@ -122,7 +122,7 @@ def _say_silent(fit: Fit) -> Iterator[str]:
         moves: dict[str, list[str]] = {}
         for name, shift in each.shifts.items():
             parameter, moved = fit.parameters[name], abs(shift * each.size)
-            of_value = f"{100.0 * moved / abs(parameter.value):.2g} %" if parameter.value else f"{moved:.3g}"
+            of_value = format_percent(moved / abs(parameter.value), 2) if parameter.value else f"{moved:.3g}"
             unit = "" if parameter.value else unit_after(parameter.unit)
             moves.setdefault(f"{of_value}{unit} {'more' if shift * each.size > 0.0 else 'less'}", []).append(name)
         would = " and ".join(f"{join_words(names)} would be {by}" for by, names in moves.items())
@@ -342,7 +342,7 @@ def _interval(ends: tuple[float, float] | None) -> str:
 
 def _known(share: float | None) -> str:
     """Return to how many percent a value is known; nothing of what an interval does not tell from zero."""
-    return f"{100 * share:.2g} %" if share is not None and share < 1.0 else MISSING
+    return format_percent(share, 2) if share is not None and share < 1.0 else MISSING
 
 
 def _percent(share: float | None) -> str:

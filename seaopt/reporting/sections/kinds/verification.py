@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from seaopt.formatting import format_count, format_number, format_values
+from seaopt.formatting import format_count, format_number, format_percent, format_values
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Table, Verdict, mark_met
 from seaopt.robustness.verification.judgement import NOMINAL, Outcome
 from seaopt.robustness.verification.verification import Verification
@@ -72,10 +72,10 @@ def _tabulate_worst(verification: Verification) -> Table:
             f"{row.peak_force_N:.4g}",
             format_number(row.final_error_N, 3),
             format_number(verification.scenario(row).final_error, 3),
-            "" if row.overshoot is None else f"{100 * row.overshoot:.3g} %",
+            "" if row.overshoot is None else format_percent(row.overshoot),
             format_number(row.settling_s, 3),
             format_number(row.peak_command, 3),
-            f"{100 * row.saturated:.3g} %",
+            format_percent(row.saturated),
             format_number(None if row.peak_angle_rad is None else math.degrees(row.peak_angle_rad), 3),
             format_number(row.peak_energy_J, 3),
             format_number(row.limit_cycle_N, 3),
@@ -148,10 +148,10 @@ def describe_steps(verification: Verification) -> Iterator[str]:
             max((row.overshoot or 0.0 for row in rows if row.overshoot_by_limit is by_limit), default=0.0)
             for by_limit in (False, True)
         )
-        limited = f" ({100 * more:.3g} % where the current limit makes it)" if more else ""
+        limited = f" ({format_percent(more)} where the current limit makes it)" if more else ""
         slowest = max(row.settling_s or 0.0 for row in rows)
         sizes = [verification.scenario(row).phases[-1].force_N for row in rows]
         settled = f"settled after {slowest:.3g} s" if math.isfinite(slowest) else "NOT settled"
         ends = " to ".join(dict.fromkeys(f"{size:.4g}" for size in (min(sizes), max(sizes))))
         unit = verification.command.reference_unit
-        yield f"steps on {plant}, {ends} {unit}: overshoot up to {100 * over:.3g} %{limited}, {settled}"
+        yield f"steps on {plant}, {ends} {unit}: overshoot up to {format_percent(over)}{limited}, {settled}"

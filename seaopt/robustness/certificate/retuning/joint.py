@@ -26,7 +26,7 @@ from seaopt.control.laws.delay import settle_delays
 from seaopt.control.tuning.tuner import name_design
 from seaopt.errors import ControlError, require_type
 from seaopt.estimation import Fit
-from seaopt.formatting import format_count, format_table, format_values, html_text
+from seaopt.formatting import format_count, format_percent, format_table, format_values, html_text
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -126,7 +126,7 @@ class JointTuning(Result):
         if self.status == "terms":
             more = "what is compensated takes more of a limit than a reserve of"
             remedy = "" if self.relief else "compensate less"
-            return f"{more} {100.0 * MOST_RESERVE:g} % makes room for: {replace(broken, remedy=remedy)}"
+            return f"{more} {format_percent(MOST_RESERVE)} makes room for: {replace(broken, remedy=remedy)}"
         if not _list_over(self.certificate):
             return f"draws keep Ms, Mt and stability, and tuning again for them mends nothing else: {broken}"
         return f"no witness is left that the tuner has not met: {broken}"

@@ -24,7 +24,7 @@ import numpy as np
 from seaopt.control import Controller, ControllerSpec, ScheduledController
 from seaopt.control.laws.limits import LIMIT_ROUNDING
 from seaopt.control.scheduling.scheduled_controller import RESERVE_BETWEEN
-from seaopt.formatting import format_values
+from seaopt.formatting import format_percent, format_values
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.progress import Progress, divide, prefix
@@ -221,7 +221,7 @@ def describe_shortfall(schedule: ScheduledController, over: Mapping[str, Look]) 
     if worst.severity >= UNSTABLE:
         return f"the schedule is unstable {where}; {what}"
     shares = (
-        (figure / level, f"{symbol} = {figure:.4g}, {100.0 * (figure / level - 1.0):.2g} % beyond {key} = {level:g}")
+        (figure / level, f"{symbol} = {figure:.4g}, {format_percent(figure / level - 1.0, 2)} beyond {key} = {level:g}")
         for symbol, figure, key in (("Ms", worst.witness.ms, MS), ("Mt", worst.witness.mt, MT))
         if (level := schedule.spec.level(key)) is not None
     )
