@@ -9,7 +9,8 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
+from itertools import chain, count
 from typing import Any, Literal
 
 import numpy as np
@@ -84,6 +85,11 @@ def format_remedies(text: str, remedies: Sequence[Mapping[str, Any]]) -> str:
     """Return a text with what to write in a problem file at its end: one remedy, or another."""
     ways = [" and ".join(format_keys({name: value}) for name, value in keys.items()) for keys in remedies]
     return f"{text}; in a problem file: {', or '.join(ways)}" if ways else text
+
+
+def tell_apart(name: str, taken: Container[str], between: str = "") -> str:
+    """Return a name that is not taken: itself, or with 2, 3, ... at its end, `between` before the number."""
+    return next(each for each in chain([name], (f"{name}{between}{k}" for k in count(2))) if each not in taken)
 
 
 def join_words(words: Sequence[str]) -> str:

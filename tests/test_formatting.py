@@ -25,6 +25,8 @@ WRITTEN = [
     (formatting.format_percent, (0.05, 3, "+"), "+5 %"),
     (formatting.format_count, (1, "sample"), "1 sample"),
     (formatting.format_count, (3, "gap"), "3 gaps"),
+    (formatting.tell_apart, ("fit", ["log"]), "fit"),
+    (formatting.tell_apart, ("fit", ["fit", "fit 2"], " "), "fit 3"),
     (formatting.join_words, (["a"],), "a"),
     (formatting.join_words, (["a", "b", "c"],), "a, b and c"),
     (formatting.html_paragraph, ("a & b",), "<p>a &amp; b</p>"),

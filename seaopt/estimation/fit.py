@@ -31,6 +31,7 @@ from seaopt.estimation.solver.least_squares import Callback
 from seaopt.estimation.solver.methods import Method, OutputError
 from seaopt.estimation.solver.settle import Solved
 from seaopt.estimation.solver.step_size import hold_bristles
+from seaopt.formatting import tell_apart
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
 from seaopt.plants.friction import can_stick, let_stick, list_smoothing
@@ -254,11 +255,8 @@ def _name_apart(experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
         require_plant(experiment.plant, f"experiments[{index}]", EstimationError)
     named: dict[str, Experiment] = {}
     for experiment in experiments:
-        name, number = experiment.name, 1
-        while name in named:
-            number += 1
-            name = f"{experiment.name}{number}"
-        named[name] = experiment if number == 1 else experiment.rename(name)
+        name = tell_apart(experiment.name, named)
+        named[name] = experiment if name == experiment.name else experiment.rename(name)
     return tuple(named.values())
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Int
 
 from seaopt.errors import LogError, require_number
-from seaopt.frequency.response import ComplexLines, FrequencyResponse, Lines, find_band, h1
+from seaopt.frequency.response import ComplexLines, FrequencyResponse, Lines, find_band, h1, measure_bend
 from seaopt.frequency.survey import check_record
 from seaopt.logs import Log
 from seaopt.plants import Plant
@@ -258,10 +258,7 @@ def _place_discs(estimate: FrequencyResponse, alpha: float, highest_hz: float) -
     f, response = estimate.frequency_hz, estimate.response
     gamma, effective = np.clip(estimate.coherence, 1e-9, 1.0 - 1e-12), INDEPENDENT * estimate.averages
     spread = np.expm1(-np.log(alpha) / max(effective - 1.0, 0.1))
-    bend = np.zeros(f.size)
-    bend[1:-1] = np.abs(response[2:] - 2.0 * response[1:-1] + response[:-2])
-    unseen = UNSEEN * np.maximum(bend, np.maximum(np.roll(bend, 1), np.roll(bend, -1)))
-    radius = np.abs(response) * np.sqrt((1.0 - gamma) / gamma * spread) + unseen
+    radius = np.abs(response) * np.sqrt((1.0 - gamma) / gamma * spread) + UNSEEN * measure_bend(response)
     inside = (f < highest_hz) & (np.arange(f.size) > 1)  # beside the mean, which is taken out, lines are off
     size = np.maximum(np.abs(response), 1e-300)
     sharp = inside & (median_filter(radius / size, SMOOTH, mode="nearest") < LARGEST_DISC)

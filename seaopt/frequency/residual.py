@@ -24,7 +24,7 @@ from jaxtyping import Complex, Float
 
 from seaopt import welch
 from seaopt.frequency.measured import UNSEEN
-from seaopt.frequency.response import Lines
+from seaopt.frequency.response import Lines, measure_bend
 from seaopt.records import record
 
 LAGS = 64  # samples that predict errors and input
@@ -105,16 +105,14 @@ def _average(u: Any, model: Any, error: Any, period: float, starts: Any, length:
     )
     of_each, of_near = (np.maximum(np.real(np.einsum("iim->im", part)), 1e-300) for part in (each, near))
     near = near * np.maximum(np.max(of_each / of_near, axis=0), 1.0)
-    e, bend = response[y:], np.zeros((y, last))
-    bend[:, 1:-1] = np.abs(e[:, 2:] - 2.0 * e[:, 1:-1] + e[:, :-2])
-    bend = np.maximum(bend, np.maximum(np.roll(bend, 1, axis=-1), np.roll(bend, -1, axis=-1)))
+    e = response[y:]
     inner = slice(1, -1)  # the outermost lines have no neighbours
     return ResidualResponse(
         frequency_hz=f[1 : last + 1][inner],
         model=response[:y, inner],
         error=e[:, inner],
         noise=(near / power)[..., inner],
-        unseen=UNSEEN * bend[:, inner],
+        unseen=UNSEEN * measure_bend(e)[:, inner],
         rough=(np.sum(welch.square(left[:y]), axis=1) / power / freedom)[:, inner],
         freedom=freedom * NEAR / ALIKE,
     )

@@ -67,6 +67,15 @@ class FrequencyResponse:
         return np.concatenate([centre[:1], centre[1:] / 1.5 + (below + above) / 6.0])
 
 
+def measure_bend(response: Complex[np.ndarray, "*k m"]) -> Float[np.ndarray, "*k m"]:
+    """Return the largest size of the second difference of a response about each line, the outermost lines' own zero;
+    the lines are its last axis.
+    """
+    bend = np.zeros(response.shape)
+    bend[..., 1:-1] = np.abs(response[..., 2:] - 2.0 * response[..., 1:-1] + response[..., :-2])
+    return np.maximum(bend, np.maximum(np.roll(bend, 1, axis=-1), np.roll(bend, -1, axis=-1)))
+
+
 def find_band(f: Lines, good: Bool[np.ndarray, " m"]) -> slice:
     """Return the lines of the widest run of good ones, on a logarithmic axis; an empty slice where there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]]))).reshape(-1, 2)

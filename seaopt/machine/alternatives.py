@@ -271,6 +271,11 @@ def _all_but_last(n: int) -> Float[np.ndarray, " n"]:
     return np.append(np.ones(n - 1), 0.0)
 
 
+def _change_place(change: Callable[[Any], Any]) -> Callable[[Setting], Setting]:
+    """Return what changes where a schedule's variable was logged; a log without it stays as it is."""
+    return _change_ticks(lambda rows: replace(rows, place=None if rows.place is None else change(rows.place)))
+
+
 def _list_places(setting: Setting) -> Iterator[Alternative]:
     """Yield where a schedule's variable may have been for the law: at a point, or in another unit."""
     law, place = setting.law, setting.ticks.place
@@ -279,14 +284,14 @@ def _list_places(setting: Setting) -> Iterator[Alternative]:
     points = law.table.points.tolist()
     over = law.table.over
     for point in dict.fromkeys([law.fallback, *points]):
-        change = _change_ticks(lambda rows, point=point: replace(rows, place=np.full(len(rows), point)))
+        change = _change_place(lambda place, point=point: np.full_like(place, point))
         yield Alternative(kind="place", what=over, value=point, unit=law.table.unit, change=change)
     for factor in (-1.0, *UNITS):
-        change = _change_ticks(lambda rows, factor=factor: _scale_place(rows, factor))
+        change = _change_place(lambda place, factor=factor: factor * place)
         kind = "sign" if factor < 0.0 else "unit"
         yield Alternative(kind=kind, what=over, value=factor, change=change)
     if (shift := _fit_place(setting)) is not None:
-        change = _change_ticks(lambda rows: _shift_place(rows, shift))
+        change = _change_place(lambda place: shift + place)
         still = stands_still(place, law.table.points)
         kind, value = ("place", float(np.median(place)) + shift) if still else ("shift", shift)
         yield Alternative(kind=kind, what=over, value=value, unit=law.table.unit, change=change, fitted=True)
@@ -304,7 +309,7 @@ def _fit_place(setting: Setting) -> float | None:
 
     def leaves(shift: float) -> float:
         try:
-            energy = play(replace(setting, ticks=_shift_place(setting.ticks, shift))).energy
+            energy = play(_change_place(lambda logged: shift + logged)(setting)).energy
         except SeaoptError:
             return math.inf
         return energy if math.isfinite(energy) else math.inf
@@ -320,14 +325,6 @@ def _fit_place(setting: Setting) -> float | None:
         leaves, bounds=tuple(ends.tolist()), method="bounded", options={"xatol": 1e-7 * np.ptp(ends)}
     )
     return float(found.x)
-
-
-def _shift_place(ticks: Ticks, shift: float) -> Ticks:
-    return replace(ticks, place=None if ticks.place is None else shift + ticks.place)
-
-
-def _scale_place(ticks: Ticks, factor: float) -> Ticks:
-    return replace(ticks, place=None if ticks.place is None else factor * ticks.place)
 
 
 def _list_of_gains(setting: Setting) -> Iterator[Alternative]:

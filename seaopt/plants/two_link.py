@@ -128,6 +128,8 @@ def _build_plant(
     drive: Drive,
     spring: Spring,
     parts: Sequence[Part],
+    sticks: bool,
+    *,
     suffixes: tuple[str, str] = ("1", "2"),
     external: bool = False,
 ) -> Plant:
@@ -138,7 +140,8 @@ def _build_plant(
     )
     part_laws.check_parts(parts)
     build = _Build(links=links, suffixes=suffixes, drive=drive, spring=spring, parts=tuple(parts), external=external)
-    return _actuator(f"{name}{drive})", build)
+    plant = _actuator(f"{name}{drive})", build)
+    return let_stick(plant) if sticks else plant
 
 
 def _actuator(name: str, build: _Build) -> Plant:
@@ -271,8 +274,7 @@ def two_link(
     >>> list(plant.states)
     ['q', 'qd', 'x_1', 'v_1', 'phi2', 'phid2']
     """
-    plant = _build_plant(f"two_link({link1}, {link2}, ", (link1, link2), drive, spring, parts, external=True)
-    return let_stick(plant) if sticks else plant
+    return _build_plant(f"two_link({link1}, {link2}, ", (link1, link2), drive, spring, parts, sticks, external=True)
 
 
 def high_impedance(
@@ -307,8 +309,7 @@ def high_impedance(
     >>> bool(abs(model.dcgain()[0, 0] - 240.33) < 0.01)  # N/A: K_tau / r
     True
     """
-    plant = _build_plant("high_impedance(", ("fixed", "fixed"), drive, spring, parts)
-    return let_stick(plant) if sticks else plant
+    return _build_plant("high_impedance(", ("fixed", "fixed"), drive, spring, parts, sticks)
 
 
 def moving_output(
@@ -336,5 +337,4 @@ def moving_output(
     >>> list(moving_output().outputs)
     ['F1', 'F2', 'q', 'phi', 'x_2']
     """
-    plant = _build_plant("moving_output(", ("fixed", "pendulum"), drive, spring, parts, suffixes=("1", ""))
-    return let_stick(plant) if sticks else plant
+    return _build_plant("moving_output(", ("fixed", "pendulum"), drive, spring, parts, sticks, suffixes=("1", ""))

@@ -45,6 +45,7 @@ from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.problem.shapes import Signal
 from seaopt.estimation.result.fit_result import Fit
+from seaopt.formatting import tell_apart
 from seaopt.records import PlotAccessor, Worded, record
 
 MENTION, STRONG, VERY_STRONG = 2.0, 6.0, 10.0  # differences of BIC (Kass and Raftery)
@@ -108,6 +109,10 @@ class Ranking(Worded):
         In the order of `rows`.
     """
 
+    json_keys = (
+        *("preferred", "evidence", "samples", "effective_samples", "sentences"),
+        *(Key(field="rows", name="ranking"), "bands"),
+    )
     plot = PlotAccessor()
 
     rows: tuple[Ranked, ...]
@@ -126,15 +131,7 @@ class Ranking(Worded):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content as numbers, lists and text."""
-        return {
-            "preferred": self.preferred,
-            "evidence": self.evidence,
-            "samples": self.samples,
-            "effective_samples": self.effective_samples,
-            "sentences": list(self.sentences),
-            "ranking": to_content(self.rows),
-            "bands": to_content(self.bands),
-        }
+        return to_content(self)
 
 
 def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
@@ -227,11 +224,7 @@ def _name_apart(fits: Sequence[Fit] | Mapping[str, Fit]) -> dict[str, Fit]:
             raise EstimationError(f"compare got a {type(fit).__name__}; give results of fit")
         if label is None:
             label = " + ".join(dict.fromkeys(experiment.plant.name for experiment in fit.experiments)) or "fit"
-        name, number = label, 1
-        while name in named:
-            number += 1
-            name = f"{label} {number}"
-        named[name] = fit
+        named[tell_apart(label, named, " ")] = fit
     if len(named) < 2:
         raise EstimationError(f"compare got {len(named)} fit; give two or more to the same logs")
     return named

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from seaopt.machine.reference_offset import Offset
 from seaopt.machine.replay import Replay
 from seaopt.machine.response.measured_margins import MARGINS
 from seaopt.machine.response.periods import say_left_out
+from seaopt.machine.response.reported import Reported
 from seaopt.machine.response.verdicts import LONGEST, SHORT_BY, Judged, Measured, Response, compares_amplitudes
 from seaopt.machine.ticks import AT_LIMIT, Gaps
 from seaopt.machine.wording import say_bias, say_cause, say_difference, say_status, say_trip, say_unsure, say_untold
@@ -371,42 +372,8 @@ def _describe_replay(result: Acceptance) -> list[Section]:
         remarks += (NO_GAINS,)
     if result.replayed:
         remarks += (_say_reach(result),)
-    remarks += tuple(
-        _say_gaps(Path(source).name, gaps, row)
-        for source, gaps, row in zip(result.sources, result.gaps, result.replays, strict=True)
-        if gaps
-    )
-    remarks += tuple(
-        BEGINS.format(Path(source).name, format_count(row.begins, "row"))
-        for source, row in zip(result.sources, result.replays, strict=True)
-        if row.begins > 1
-    )
-    remarks += tuple(
-        f"In {Path(source).name} {say_trip(result.controller, row.trip)}. What comes after is left out of the response "
-        "and of the log for a fit."
-        for source, row in zip(result.sources, result.replays, strict=True)
-        if row.trip
-    )
-    remarks += tuple(
-        f"By {Path(source).name} {said}."
-        for source, reported, row in zip(result.sources, result.reported, result.replays, strict=True)
-        if reported is not None and (said := say_status(reported, row))
-    )
-    remarks += tuple(
-        f"{Path(source).name} does not exclude that {', or that '.join(map(say, row.possible))}."
-        for source, row in zip(result.sources, result.replays, strict=True)
-        if row.met and row.possible
-    )
-    remarks += tuple(
-        _say_offset(Path(source).name, row.offset, unit_after(result.controller.command.reference_unit))
-        for source, row in zip(result.sources, result.replays, strict=True)
-        if row.offset is not None
-    )
-    remarks += tuple(
-        HIDDEN.format(Path(source).name, format_number(row.causes[0].sigmas, 2))
-        for source, row in zip(result.sources, result.replays, strict=True)
-        if row.causes and row.causes[0].sigmas is not None
-    )
+    for source, gaps, reported, row in zip(result.sources, result.gaps, result.reported, result.replays, strict=True):
+        remarks += tuple(_remark_log(result.controller, Path(source).name, gaps, reported, row))
     sections = [
         Section(
             title="Replay",
@@ -433,6 +400,28 @@ def _describe_replay(result: Acceptance) -> list[Section]:
                 Section(title=f"Causes that were tried on {Path(source).name}", part="causes", tables=(table,))
             )
     return sections
+
+
+def _remark_log(
+    controller: Controller, name: str, gaps: Gaps | None, reported: Reported | None, row: Replay
+) -> Iterator[str]:
+    """Yield what is to be known of one log beside how near its replay comes."""
+    if gaps:
+        yield _say_gaps(name, gaps, row)
+    if row.begins > 1:
+        yield BEGINS.format(name, format_count(row.begins, "row"))
+    if row.trip:
+        trip = say_trip(controller, row.trip)
+        yield f"In {name} {trip}. What comes after is left out of the response and of the log for a fit."
+    if reported is not None and (status := say_status(reported, row)):
+        yield f"By {name} {status}."
+    if row.met and row.possible:
+        possible = ", or that ".join(say_cause(each, controller.command.input) for each in row.possible)
+        yield f"{name} does not exclude that {possible}."
+    if row.offset is not None:
+        yield _say_offset(name, row.offset, unit_after(controller.command.reference_unit))
+    if row.causes and row.causes[0].sigmas is not None:
+        yield HIDDEN.format(name, format_number(row.causes[0].sigmas, 2))
 
 
 def _say_offset(name: str, offset: Offset, unit: str) -> str:

@@ -40,7 +40,7 @@ from jaxtyping import Complex, Float
 from seaopt.codec import Key
 from seaopt.control import Controller
 from seaopt.control.loops.loop import Loop
-from seaopt.control.loops.measured.loop import bound_disc
+from seaopt.control.loops.measured.loop import bound_disc, find_first
 from seaopt.control.loops.peaks import HALF_POWER
 from seaopt.machine.response.discs import Ratio
 from seaopt.machine.response.judged import Doubt, Judged, Measured, Outcome, Prediction
@@ -588,11 +588,5 @@ def _find_least_bandwidth(controller: Controller) -> tuple[float, bool]:
 
 def _find_fall(f: Float[np.ndarray, " m"], size: Float[np.ndarray, " m"]) -> float:
     """Return where a curve first falls below -3 dB, by a straight line; infinite where it does not."""
-    down = np.flatnonzero(size < HALF_POWER)
-    if not down.size:
-        return math.inf
-    k = int(down[0])
-    if k == 0:
-        return float(f[0])
-    share = (size[k - 1] - HALF_POWER) / (size[k - 1] - size[k])
-    return float(f[k - 1] + share * (f[k] - f[k - 1]))
+    first = find_first(f, HALF_POWER - size)
+    return math.inf if first is None else first

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import count
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from seaopt.formatting import format_toml, printable
+from seaopt.formatting import format_toml, printable, tell_apart
 from seaopt.logs import assess_quality
 from seaopt.logs.quality.clock import JITTER_LIMIT
 from seaopt.problem.proposal.actuators import DESIGN, ParameterLine, Proposed, screw_travel
@@ -56,7 +55,7 @@ def write_problem_text(title: str, logs: Sequence[DescribedLog], actuator: Propo
             lines += [f"# parts = {format_toml([*parts, 'stribeck'])}", "# sticks = true  # friction jumps at rest"]
     names, single = set[str](), list_single(logs)
     for log in logs:
-        name = next(name for name in _number_names(log.name) if name not in names)
+        name = tell_apart(log.name, names, "_")
         names.add(name)
         keys = [_describe_delay(log, logs)]
         if log is not logs[0]:
@@ -157,12 +156,6 @@ def _describe_fit(logs: Sequence[DescribedLog]) -> list[str]:
     elif lasts:
         rows.append('# loss = "huber"  # if there are outliers')
     return ["", "[fit]", *rows] if rows else []
-
-
-def _number_names(name: str) -> Iterator[str]:
-    """Yield a name, and then the name with 2, 3, ... at its end."""
-    yield name
-    yield from (f"{name}_{number}" for number in count(2))
 
 
 def _describe_experiment(log: DescribedLog, name: str, interview: Interview) -> Rows:

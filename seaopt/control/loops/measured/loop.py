@@ -122,7 +122,7 @@ class DiscLoop:
         (least, most), s = sizes["P C_r"], sizes["1"][1]
         crossovers = find_crossings(lambda x: np.abs(self.open_loop(x)) - 1.0, f)
         ms, static = float(np.max(s)), 1.0 if self.law.integrators else float(least[0])
-        down, top = (_first(f, HALF_POWER * static - size) for size in (least, most))
+        down, top = (find_first(f, HALF_POWER * static - size) for size in (least, most))
         if down is not None and asked_hz is not None and KNOWN_TO * asked_hz <= down <= asked_hz <= (top or np.inf):
             down = asked_hz
         droop = np.min(least[f <= DROOP_BAND * (down or f[-1])], initial=static)
@@ -136,7 +136,7 @@ class DiscLoop:
             bandwidth_hz=down,
             tracking_band_hz=_band(f, least, most),
             crossover_hz=float(crossovers[-1]) if crossovers.size else None,
-            sensitivity_bandwidth_hz=_first(f, s - HALF_POWER) or float(f[-1]),
+            sensitivity_bandwidth_hz=find_first(f, s - HALF_POWER) or float(f[-1]),
             ms=ms,
             mt=mt,
             ms_hz=float(f[np.argmax(s)]),
@@ -158,7 +158,7 @@ class DiscLoop:
         f = self.grid()
         (sizes,) = self.bound(f, "P C_r")
         static = 1.0 if self.law.integrators else float(sizes[0][0])
-        least, most = (_first(f, HALF_POWER * static - size) for size in sizes)
+        least, most = (find_first(f, HALF_POWER * static - size) for size in sizes)
         return least, most
 
     def _find_return(self, f: Frequencies, most: Frequencies, down: float, static: float) -> float | None:
@@ -220,7 +220,7 @@ def map_disc(
             raise AssertionError(of)
 
 
-def _first(f: Frequencies, over: Frequencies) -> float | None:
+def find_first(f: Frequencies, over: Frequencies) -> float | None:
     """Return the first frequency at which a curve is above zero, by a straight line; None where it never is."""
     above = np.flatnonzero(over > 0.0)
     if not above.size:
