@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from seaopt.control.frontier.free_law import FreeLaw, bound_free_law
 from seaopt.control.frontier.rows import Frontier, FrontierRow, SlidingAlone, make_row, measure_disturbance
-from seaopt.control.frontier.scheduled import ScheduleSweep, slide_plants, sweep_schedule
+from seaopt.control.frontier.scheduled import Chain, ScheduleSweep, slide_plants, tune_chains, tune_row
 from seaopt.control.laws.command import command_of
 from seaopt.control.laws.controller import Controller
 from seaopt.control.laws.delay import settle_delays, take_own_delays
@@ -27,7 +26,7 @@ from seaopt.control.tuning.solution import feed_link, lower_fraction, search, so
 from seaopt.control.tuning.tuner import Draws, RobustTo, aim_task, make_controller, make_task, name_design
 from seaopt.errors import ControlError, require_number, require_type
 from seaopt.estimation import Fit
-from seaopt.executors import Shared, check_executor, map_ordered
+from seaopt.executors import check_executor
 from seaopt.frequency import MeasuredResponse
 from seaopt.parameters import ParameterSet
 from seaopt.plants import Plant
@@ -125,7 +124,7 @@ def sweep(
             outer=outer,
             free_law=free_law,
         )
-        pairs = sweep_schedule(schedules, specs, executor, progress)
+        pairs = list(tune_chains(tune_row, schedules, [[each] for each in specs], executor, progress))
         progress(f"{spec.structure} over {over}, {len(pairs)} bandwidths", 1.0)
         return Frontier(rows=tuple(row for row, _ in pairs), controllers=tuple(law for _, law in pairs), over=over)
     sliding, sliding_robust_to = slide_plants(plant, params, robust_to)
@@ -138,7 +137,8 @@ def sweep(
     )
     rows: list[FrontierRow] = []
     controllers: list[Controller] = []
-    for point, solved in zip(specs, _solve_chains(swept, specs, executor, progress), strict=True):
+    chains = [specs[k : k + CHAIN] for k in range(0, len(specs), CHAIN)]
+    for point, solved in zip(specs, tune_chains(_solve_chain, swept, chains, executor, progress), strict=True):
         task = swept.surround(feed_link(replace(swept.task, spec=point), solved.link), solved.outer)
         controllers.append(make_controller(task, solved.x, solved.loops, swept.design))
         compared: dict[str, Any] = {"without_sticking": solved.without_sticking, "free_law": solved.free_law}
@@ -186,27 +186,7 @@ class _SolvedBandwidth:
     free_law: FreeLaw | None
 
 
-def _solve_chains(
-    swept: _SweepTask, specs: Sequence[ControllerSpec], executor: Executor | None, progress: Progress
-) -> Iterator[_SolvedBandwidth]:
-    """Yield the solution of each specification, in their order."""
-    chains = [specs[k : k + CHAIN] for k in range(0, len(specs), CHAIN)]
-    parts = divide(progress, *(float(len(chain)) for chain in chains))
-    if executor is None:
-        for chain, part in zip(chains, parts, strict=True):
-            yield from _solve_chain(swept, chain, part)
-        return
-    done = map_ordered(partial(_solve_part, Shared(swept)), chains, executor)
-    for chain, part, solved in zip(chains, parts, done, strict=True):
-        part(f"{chain[-1].bandwidth_hz:g} Hz", 1.0)
-        yield from solved
-
-
-def _solve_part(swept: Shared[_SweepTask], chain: Sequence[ControllerSpec]) -> list[_SolvedBandwidth]:
-    return list(_solve_chain(swept.value, chain, ignore))
-
-
-def _solve_chain(swept: _SweepTask, chain: Sequence[ControllerSpec], progress: Progress) -> Iterator[_SolvedBandwidth]:
+def _solve_chain(swept: _SweepTask, chain: Chain, progress: Progress) -> Iterator[_SolvedBandwidth]:
     """Yield the solution of each specification; every one but the first also starts from the one before."""
     warm: tuple[LawNumbers, ...] = ()
     for point, part in zip(chain, divide(progress, *(1.0 for _ in chain)), strict=True):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from seaopt.control.frontier.free_law import bound_free_law
 from seaopt.control.frontier.rows import FrontierRow, SlidingAlone, make_row
@@ -23,6 +23,9 @@ from seaopt.plants import Plant
 from seaopt.plants.friction import take_sliding
 from seaopt.progress import Progress, divide, ignore, prefix
 from seaopt.records import record
+
+S = TypeVar("S")
+T = TypeVar("T")
 
 
 def slide_plants(
@@ -100,29 +103,37 @@ class ScheduleSweep:
         return rows
 
 
-def sweep_schedule(
-    swept: ScheduleSweep, specs: Sequence[ControllerSpec], executor: Executor | None, progress: Progress
-) -> list[tuple[FrontierRow, ScheduledController]]:
-    """Return the row and the schedule of each specification."""
-    parts = divide(progress, *(1.0 for _ in specs))
+Chain = Sequence[ControllerSpec]  # bandwidths that are tuned one after the other
+
+
+def tune_chains(
+    tune: Callable[[S, Chain, Progress], Iterable[T]],
+    swept: S,
+    chains: Sequence[Chain],
+    executor: Executor | None,
+    progress: Progress,
+) -> Iterator[T]:
+    """Yield what `tune` makes of each specification of some chains, in their order, here or where an executor works."""
+    parts = divide(progress, *(float(len(chain)) for chain in chains))
     if executor is None:
-        return [_tune_row(swept, spec, part) for spec, part in zip(specs, parts, strict=True)]
-    pairs: list[tuple[FrontierRow, ScheduledController]] = []
-    done = map_ordered(partial(_tune_part, Shared(swept)), specs, executor)
-    for spec, part, row_and_law in zip(specs, parts, done, strict=True):
-        part(f"{spec.bandwidth_hz:g} Hz", 1.0)
-        pairs.append(row_and_law)
-    return pairs
+        for chain, part in zip(chains, parts, strict=True):
+            yield from tune(swept, chain, part)
+        return
+    done = map_ordered(partial(_tune_apart, tune, Shared(swept)), chains, executor)
+    for chain, part, tuned in zip(chains, parts, done, strict=True):
+        part(f"{chain[-1].bandwidth_hz:g} Hz", 1.0)
+        yield from tuned
 
 
-def _tune_part(swept: Shared[ScheduleSweep], spec: ControllerSpec) -> tuple[FrontierRow, ScheduledController]:
-    return _tune_row(swept.value, spec, ignore)
+def _tune_apart(tune: Callable[[S, Chain, Progress], Iterable[T]], swept: Shared[S], chain: Chain) -> list[T]:
+    return list(tune(swept.value, chain, ignore))
 
 
-def _tune_row(
-    swept: ScheduleSweep, spec: ControllerSpec, progress: Progress
-) -> tuple[FrontierRow, ScheduledController]:
-    """Return the row of one bandwidth with its schedule."""
+def tune_row(
+    swept: ScheduleSweep, chain: Chain, progress: Progress
+) -> Iterator[tuple[FrontierRow, ScheduledController]]:
+    """Yield the row of one bandwidth with its schedule."""
+    (spec,) = chain
     whole, part = divide(prefix(progress, f"{spec.bandwidth_hz:g} Hz"), 1.0, float(swept.sticks))
     schedule, alone = swept.tune(spec, whole), None
     if swept.sticks:
@@ -135,7 +146,7 @@ def _tune_row(
             disturbance=max(row.disturbance for row in places),
         )
     row = _take_worst(swept.measure(schedule, free_law=swept.free_law), schedule)
-    return replace(row, without_sticking=alone), schedule
+    yield replace(row, without_sticking=alone), schedule
 
 
 def _take_worst(rows: Sequence[FrontierRow], schedule: ScheduledController) -> FrontierRow:
