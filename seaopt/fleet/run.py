@@ -38,7 +38,7 @@ def fit_fleet(
     time_limit_s: float | None = TIME_LIMIT_S,
     progress: Progress = ignore,
 ) -> Fleet:
-    """Fit each of many logs by itself, as one experiment of a problem says.
+    """Fit each of many logs by itself, as one experiment of a problem says: a `Fleet`, one row each.
 
     Parameters
     ----------
@@ -60,11 +60,6 @@ def fit_fleet(
         For one log; None for none.
     progress : callable, optional
         Called with what is done and the share of it (`seaopt.progress.Progress`).
-
-    Returns
-    -------
-    Fleet
-        Of these logs, one row each.
 
     Raises
     ------

@@ -262,7 +262,7 @@ def accept(
     played: Played | None = None,
     link: tuple[Plant, ParameterSet] | None = None,
 ) -> Acceptance:
-    """Judge logs that were recorded under a controller's exported law.
+    """Judge logs that were recorded under a controller's exported law (`Acceptance`).
 
     Parameters
     ----------
@@ -288,10 +288,6 @@ def accept(
         How long the reference is that was to be played: a log that is shorter than its period is told so.
     link : (Plant, ParameterSet), optional
         The plant whose link the law's outer loop moves, with its values, for logs in which it ran.
-
-    Returns
-    -------
-    Acceptance
 
     Raises
     ------

@@ -66,11 +66,6 @@ def export_fmu(plant: Plant, params: ParameterSet, path: Path | str, *, include:
         A folder with the FMI 3.0 headers: with it and a C compiler, a binary for this platform is included. Without,
         the importing tool compiles the sources.
 
-    Returns
-    -------
-    Path
-        The file.
-
     Raises
     ------
     PlantError

@@ -26,7 +26,7 @@ def write_frequency_figure(
     given: ParameterSet | None = None,
     fitted: Mapping[str, tuple[Survey, Fit]] | None = None,
 ) -> list[Path]:
-    """Draw frequency responses of experiments to SVG and PNG.
+    """Draw frequency responses of experiments to SVG and PNG; return both files.
 
     Parameters
     ----------
@@ -39,11 +39,6 @@ def write_frequency_figure(
     fitted : mapping of experiment to (Survey, Fit), optional
         Surveys under a fit's delays and gains, and the fit: the model is drawn as fitted.
 
-    Returns
-    -------
-    list of Path
-        The two files.
-
     Raises
     ------
     FileError
@@ -53,25 +48,20 @@ def write_frequency_figure(
 
 
 def write_frontier_figure(frontier: Frontier, path: Path | str) -> list[Path]:
-    """Draw a sweep of bandwidths to SVG and PNG.
+    """Draw a sweep of bandwidths to SVG and PNG; return both files.
 
     Parameters
     ----------
     frontier : Frontier
         Of `seaopt.control.sweep`.
     path : path
-        Without suffix; ``.svg`` and ``.png`` are added.
-
-    Returns
-    -------
-    list of Path
-        Both files.
+        As of `write_frequency_figure`.
     """
     return write_figure(compose_sheet(frontier_panels(frontier), FRONTIER_COLUMNS, final=True), path)
 
 
 def write_quality_figure(data: Log | RawLog, quality: Quality, path: Path | str) -> list[Path]:
-    """Draw a quality report to SVG and PNG.
+    """Draw a quality report to SVG and PNG; return both files.
 
     Parameters
     ----------
@@ -80,12 +70,7 @@ def write_quality_figure(data: Log | RawLog, quality: Quality, path: Path | str)
     quality : Quality
         The report.
     path : path
-        Without suffix; ``.svg`` and ``.png`` are added.
-
-    Returns
-    -------
-    list of Path
-        The two files.
+        As of `write_frequency_figure`.
 
     Raises
     ------

@@ -55,7 +55,7 @@ def critical_impedance(
     *,
     velocity_filter_s: float | None = None,
 ) -> Impedance:
-    """Return the damping that makes a stiffness at the link critically damped: two of its poles are one real one.
+    """Return the `Impedance` of a stiffness at the link that is critically damped: two of its poles are one real one.
 
     Parameters
     ----------
@@ -63,10 +63,6 @@ def critical_impedance(
         As `seaopt.control.passive_region`.
     stiffness : float
         K_v, N/m or N m/rad.
-
-    Returns
-    -------
-    Impedance
 
     Raises
     ------

@@ -140,7 +140,7 @@ def passive_region(
     link_damping: float | None = None,
     points: int = MAP_POINTS,
 ) -> ImpedanceRegion:
-    """Map which stiffness and damping may be rendered at the link around a force loop.
+    """Map which stiffness and damping may be rendered at the link around a force loop (`ImpedanceRegion`).
 
     Parameters
     ----------
@@ -156,10 +156,6 @@ def passive_region(
         The damper at the link, in place of its own.
     points : int
         Of the grid in each direction.
-
-    Returns
-    -------
-    ImpedanceRegion
 
     Raises
     ------

@@ -150,7 +150,7 @@ def render(
     *,
     link_damping: float | None = None,
 ) -> Rendering:
-    """Measure an impedance that is rendered at the link, closed around a force loop.
+    """Measure an impedance that is rendered at the link, closed around a force loop (`Rendering`).
 
     Parameters
     ----------
@@ -158,10 +158,6 @@ def render(
         As `seaopt.control.passive_region`.
     impedance : Impedance
         Stiffness, damping and the filter of the speed.
-
-    Returns
-    -------
-    Rendering
 
     Raises
     ------

@@ -119,7 +119,7 @@ class Scorecard(Worded):
 def scorecard(
     controllers: Mapping[str, Controller], plant: Plant | None = None, parameters: ParameterSet | None = None
 ) -> Scorecard:
-    """Score controllers on four axes: tracking, apparent impedance, its passivity, noise.
+    """Return the `Scorecard` of controllers on four axes: tracking, apparent impedance, its passivity, noise.
 
     Parameters
     ----------
@@ -127,10 +127,6 @@ def scorecard(
         Tuned, or laws of one's own (`seaopt.assess`).
     plant, parameters
         The actuator; each controller's own design plant if left out.
-
-    Returns
-    -------
-    Scorecard
 
     Raises
     ------

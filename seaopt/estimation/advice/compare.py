@@ -135,17 +135,13 @@ class Ranking(Worded):
 
 
 def compare(fits: Sequence[Fit] | Mapping[str, Fit]) -> Ranking:
-    """Rank fits of several models, or by several methods, to the same logs.
+    """Rank fits of several models, or by several methods, to the same logs (`Ranking`).
 
     Parameters
     ----------
     fits : sequence of Fit, or mapping of name to Fit
         Two or more, as `fit` returned them, from the same experiments: the same logs, outputs, samples used, band and
         loss. In a sequence each is named after its plants.
-
-    Returns
-    -------
-    Ranking
 
     Raises
     ------

@@ -101,16 +101,12 @@ class Diagnostics(Result, Worded):
 
 
 def diagnose(fit: Fit) -> Diagnostics:
-    """Test a fit: residuals, predictions, bounds, and where its information comes from.
+    """Test a fit: residuals, predictions, bounds, and where its information comes from (`Diagnostics`).
 
     Parameters
     ----------
     fit : Fit
         As `fit` returned it.
-
-    Returns
-    -------
-    Diagnostics
 
     Raises
     ------

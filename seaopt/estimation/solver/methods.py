@@ -112,12 +112,10 @@ class MultipleShooting(Method):
     segments : int
         Shots per log segment; a segment shorter than the longest may have fewer. Each shot needs a sample more than the
         plant has states, and at least four.
-    max_iterations : int
-        Of least squares.
+    max_iterations, seed
+        As in `OutputError`.
     search : bool
         Start from the logs' frequency responses where they explain the logs better than the given values.
-    seed : int
-        Of that search.
     """
 
     key: ClassVar[str] = "multiple_shooting"
@@ -188,12 +186,10 @@ class PredictionError(Method):
 
     Parameters
     ----------
-    max_iterations : int
-        Of least squares.
+    max_iterations, seed
+        As in `OutputError`.
     search : bool
         Start from the logs' frequency responses where they explain the logs better than the given values.
-    seed : int
-        Of that search.
     """
 
     key: ClassVar[str] = "prediction_error"

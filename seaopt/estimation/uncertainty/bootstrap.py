@@ -126,7 +126,7 @@ def bootstrap(
     block: int | None = None,
     executor: Executor | None = None,
 ) -> Bootstrap:
-    """Return how the parameters vary when blocks of the residuals are resampled.
+    """Return how the parameters vary when blocks of the residuals are resampled (`Bootstrap`).
 
     Parameters
     ----------
@@ -142,10 +142,6 @@ def bootstrap(
         Length of the blocks in samples; from the residuals' correlation if left out.
     executor : concurrent.futures.Executor, optional
         Where refits are made; here, if left out. The numbers are the same, bit for bit (`seaopt.executors`).
-
-    Returns
-    -------
-    Bootstrap
 
     Raises
     ------

@@ -107,7 +107,7 @@ class Profile:
 
 
 def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, coloured: bool = True) -> Profile:
-    """Return the likelihood-ratio interval of a parameter, and the curve that it is read off.
+    """Return the likelihood-ratio interval of a parameter, and the curve that it is read off (`Profile`).
 
     Parameters
     ----------
@@ -121,10 +121,6 @@ def profile(fit: Fit, name: str, *, points: int = 9, level: float = 0.95, colour
         Of the interval.
     coloured : bool
         Scale the rise for coloured residuals; False takes them as white.
-
-    Returns
-    -------
-    Profile
 
     Raises
     ------

@@ -487,27 +487,9 @@ def write_acceptance_page(
     logs: Sequence[Path | str] = (),
     command: str = "",
 ) -> Path:
-    """Write an HTML page of an acceptance; it needs no network and no other file.
-
-    Parameters
-    ----------
-    result : Acceptance
-        Of `accept`.
-    path : path
-        The page.
-    title : str
-        Heading of the page.
-    files : sequence of path
-        The problem file.
-    logs : sequence of path
-        The logs that were judged.
-    command : str
-        What was typed to make it, to be stated.
-
-    Raises
-    ------
-    FileError
-        The folder cannot be written.
+    """Write an HTML page of an acceptance; it needs no network and no other file. `title`: its heading. `files`: the
+    problem file. `logs`: those that were judged. `command`: what was typed to make it, to be stated. Raises FileError:
+    the folder cannot be written.
     """
     return write_result_page(
         path,

@@ -158,11 +158,6 @@ def write_report(
     expectations : sequence of (bool, str)
         Of a problem file: whether each is met, and what to say of it.
 
-    Returns
-    -------
-    Path
-        The page.
-
     Raises
     ------
     SeaoptError

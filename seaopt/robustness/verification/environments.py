@@ -166,7 +166,7 @@ def coupled_stability(
     dampings_N_s_per_m: tuple[float, ...] | None = None,
     points: int = MAP_POINTS,
 ) -> StabilityMap:
-    """Map where a controller is stable against a mass on a spring and a damper at link 2.
+    """Map where a controller is stable against a mass on a spring and a damper at link 2 (`StabilityMap`).
 
     Parameters
     ----------
@@ -181,10 +181,6 @@ def coupled_stability(
         Each has a map of its own; N m s/rad of a port that turns. `DAMPINGS` if left out.
     points : int
         Points of the grid in each direction.
-
-    Returns
-    -------
-    StabilityMap
 
     Raises
     ------

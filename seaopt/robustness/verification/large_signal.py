@@ -96,7 +96,7 @@ def large_signal(
     frequencies_hz: tuple[float, ...] | None = None,
     progress: Progress = ignore,
 ) -> LargeSignal:
-    """Sweep a controller over frequency and amplitude on a nonlinear plant, without noise.
+    """Sweep a controller over frequency and amplitude on a nonlinear plant, without noise (`LargeSignal`).
 
     Parameters
     ----------
@@ -111,10 +111,6 @@ def large_signal(
         with whole periods in whole samples.
     progress : callable, optional
         Called before each frequency (`seaopt.progress.Progress`).
-
-    Returns
-    -------
-    LargeSignal
 
     Raises
     ------

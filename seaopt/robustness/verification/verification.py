@@ -216,7 +216,7 @@ def verify(
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> Verification:
-    """Simulate a controller, as exported, on nonlinear plants.
+    """Simulate a controller, as exported, on nonlinear plants (`Verification`).
 
     Parameters
     ----------
@@ -249,10 +249,6 @@ def verify(
         Where scenarios are played (`seaopt.executors`); here, if left out. The outcomes are the same, bit for bit.
     progress : callable, optional
         Called before each scenario (`seaopt.progress.Progress`).
-
-    Returns
-    -------
-    Verification
 
     Raises
     ------

@@ -167,7 +167,7 @@ def tune_certified(
     executor: Executor | None = None,
     progress: Progress = ignore,
 ) -> JointTuning:
-    """Tune, certify, and tune again with the worst cases found, until the certificate passes.
+    """Tune, certify, and tune again with the worst cases found, until the certificate passes (`JointTuning`).
 
     Parameters
     ----------
@@ -200,10 +200,6 @@ def tune_certified(
         Of the certificates, as in `certify`.
     progress : callable, optional
         Called with what is done and the share of it that is done (`seaopt.progress.Progress`).
-
-    Returns
-    -------
-    JointTuning
 
     Raises
     ------
