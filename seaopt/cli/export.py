@@ -15,7 +15,7 @@ from seaopt.cli.terminal import Amount, Terminal
 from seaopt.codec import from_content, to_content
 from seaopt.control import Controller
 from seaopt.control.deploy.c_text import strip_markup
-from seaopt.control.deploy.export import export, read_guard
+from seaopt.control.deploy.export import export, export_beside, read_guard
 from seaopt.control.deploy.target import Tare
 from seaopt.control.laws.plausibility import Agreement, GateSpec, PlausibilityGate
 from seaopt.control.laws.realisation import choose_limit, find_raised_limit
@@ -230,11 +230,12 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
             f"the controller misses {_join_missed(content)}; tune one that does not, or type --allow-infeasible"
         )
     gate, derate, uncertified = options.pop("gate"), options.pop("derate"), options.pop("uncertified")
+    beside = {name: options.pop(name) for name in ("log_rows", "tare")}
     typed = {name for name, value in options.items() if value not in (None, False) and name != "precision"}
     if typed - {"name"} or options["name"] != "force_law":
         raise ProblemError(
             "the C code of predictive control has the limits and the names that it was designed with: force_mpc_...; "
-            "leave out all options but --precision, --derate and those of --gate"
+            "leave out all options but --precision, --derate, --log-rows, --tare and those of --gate"
         )
     if options["precision"] not in ("double", "float"):
         raise ProblemError(f'precision = "{options["precision"]}" is not known; use "double" or "float"')
@@ -249,7 +250,8 @@ def _write_plan(content: Mapping[str, Any], target: Path, **options: Any) -> tup
     folder = write_code(
         code, target, single_precision=options["precision"] == "float", uncertified=strip_markup(uncertified)
     )
-    return tuple(folder / name for name in (*SOURCES, "force_mpc_data.h", *code.parts))
+    made = export_beside(Controller.read(content), folder, precision=options["precision"], **beside)
+    return (*(folder / name for name in (*SOURCES, "force_mpc_data.h", *code.parts)), *made)
 
 
 def list_broken_requirements(controller: Path, certificate: Path) -> list[str] | None:

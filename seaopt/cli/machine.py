@@ -380,8 +380,6 @@ def plan_bring_up(
     """Plan the stages of the folder's controller, write and print them; return whether each has a certified law."""
     session, zeroing = Session(problem, folder), parse_tare(tare)
     source, errors, controller = session.parameters(), Terminal(stderr=True), _find_law(session, None)
-    if zeroing is not None and isinstance(controller, ForceMPC):
-        raise ProblemError(f"--tare {tare}: predictive control has no C beside it that averages a zero; leave it out")
 
     def tune_stage(fraction: float) -> Source:
         slower = _slow_down(session.problem, fraction)

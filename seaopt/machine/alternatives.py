@@ -21,6 +21,7 @@ from seaopt.machine.stepped import (
     Others,
     Setting,
     Source,
+    change_plan,
     find_limited,
     find_modes,
     follow,
@@ -247,6 +248,9 @@ def _list_of_guards(setting: Setting) -> Iterator[Alternative]:
         yield Alternative(kind="gate", what="left out", change=_change_law(gate=None))
     if law.heat is not None:
         yield Alternative(kind="heat", what="left out", change=_change_law(heat=None))
+    if isinstance(law, ForceMPC) and law.spec.preview_samples:
+        blind = change_plan(law, replace(law.spec, preview_samples=0))
+        yield Alternative(kind="part", what="preview", change=lambda given: replace(given, law=blind))
     if not isinstance(law, ForceMPC) and np.any(law.anti_windup):
         yield Alternative(kind="anti-windup", what="left out", change=_leave_windup)
     added = linear.compensation

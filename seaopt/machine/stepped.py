@@ -137,7 +137,9 @@ def run_setting(setting: Setting, ticks: Ticks, start: State) -> Float[np.ndarra
 def _run_plan(
     law: ForceMPC, ticks: Ticks, state: MPCState, *, follow: bool = False
 ) -> tuple[Float[np.ndarray, " n"], MPCState]:
-    """Return the commands of predictive control, and its last state; `follow`: as if each command were the log's."""
+    """Return the commands of predictive control, and its last state; `follow`: as if each command were the log's. The
+    last rows, whose references ahead are not in the log, have its commands.
+    """
     out, ahead = np.empty(len(ticks)), law.spec.preview_samples + 1
     rows, names = np.column_stack([ticks.further, ticks.measured]), (*law.further, *law.signals)
     for k, readings in enumerate(rows[:, [names.index(name) for name in law.reads]].tolist()):
@@ -149,7 +151,8 @@ def _run_plan(
             line[-1, 0] = ticks.command[k] - result.state.terms[1] * law.per_effort
             kalman = law.kalman.go_on(line, state.kalman.corrected, state.kalman.innovation)
             state = replace(state, command=float(ticks.command[k]), kalman=kalman)
-    return out, state
+    told = len(ticks) - law.spec.preview_samples
+    return np.append(out[:told], ticks.command[told:]), state
 
 
 def list_starts(setting: Setting) -> Iterator[tuple[State, int]]:
@@ -185,8 +188,8 @@ def _refine_start(law: ForceMPC, ticks: Ticks, state: MPCState) -> MPCState:
     modes, moved = np.empty((len(ticks), n)), np.eye(linear.c.size)[:, :n]
     for k in range(len(ticks)):
         modes[k], moved = linear.c @ moved, linear.a @ moved
-    left = ticks.command - _run_plan(law, ticks, state)[0]
-    predicted = state.kalman.predicted + np.linalg.lstsq(modes, left, rcond=1e-10)[0]
+    left, told = ticks.command - _run_plan(law, ticks, state)[0], len(ticks) - law.spec.preview_samples
+    predicted = state.kalman.predicted + np.linalg.lstsq(modes[:told], left[:told], rcond=1e-10)[0]
     return replace(state, kalman=replace(state.kalman, predicted=predicted))
 
 

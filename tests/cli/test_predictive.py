@@ -71,6 +71,13 @@ def test_it_is_designed_certified_and_exported(planned, seaopt):
     export_mpc(design_mpc(problem, problem.parameters), planned / "python")
     for name in ("force_mpc_data.h", "force_mpc.c", "active_set.c"):
         assert (planned / "code" / name).read_bytes() == (planned / "python" / name).read_bytes()
+    ringed = seaopt("export", "out", "--c", "code", "--precision", "float", "--log-rows", "64", "--tare", "2:50")
+    assert ringed.returncode == 0 and (planned / "code" / "force_mpc_tare.c").is_file(), ringed.stderr
+    assert "64UL /* a power of two */" in (planned / "code" / "force_mpc_log.h").read_text(encoding="utf-8")
+    assert '"float32' in (planned / "code" / "force_mpc_log.c").read_text(encoding="utf-8").replace("\\", "")
+    assert "--log-rows, --tare and those of --gate" in " ".join(
+        seaopt("export", "out", "--c", "code", "--name", "knee").stderr.split()
+    )
     narrower = PLANNED.replace("0.08]", "0.07]")
     (planned / "plan.toml").write_text(narrower, encoding="utf-8")
     assert "made from another problem file" in seaopt("certify", "plan.toml", "-o", "out").stderr

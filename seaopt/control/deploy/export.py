@@ -62,6 +62,7 @@ from seaopt.plants.motor.thermal import MotorRating
 from seaopt.units import mechanics_of
 
 TEMPLATES = {"{}.h": "law.h.jinja", "{}.c": "law.c.jinja", "{}_gains.h": "gains.h.jinja", "{}_gains.m": "gains.m.jinja"}
+PLAN = "force_mpc"  # prefix of the names in C of predictive control
 FIGURES = {
     "bandwidth_hz": "bandwidth {:.4g} Hz", "ms": "Ms {:.4g}", "mt": "Mt {:.4g}", "noise_gain": "noise gain {:.4g}",
     "gain_margin_db": "gain margin {:.4g} dB", "phase_margin_deg": "phase margin {:.4g} deg",
@@ -200,27 +201,83 @@ def export(
         "uncertified": strip_markup(uncertified),
         "raised_from": strip_markup(find_raised_limit(stored.command, stored.spec, limit)),
     }
-    templates = dict(templates)
+    beside, described = _describe_beside(context, stored, law, log_rows, tare, stop)
+    texts = {
+        pattern.format(prefix): render(template, context | described | numbers.get(pattern[-2:], {}))
+        for pattern, template in {**templates, **beside}.items()
+    }
+    return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+
+
+def export_beside(
+    controller: Controller,
+    folder: Path | str,
+    *,
+    precision: Precision = "double",
+    log_rows: int | None = None,
+    tare: Tare | None = None,
+    stop: Mapping[str, float] | None = None,
+) -> tuple[Path, ...]:
+    """Write beside the C code of predictive control what `export` writes beside a law: log, stage and tare.
+
+    Parameters
+    ----------
+    controller : Controller
+        The law while no limit is active, of `seaopt.robustness.linear_controller`.
+    folder, precision, log_rows, tare, stop
+        As in `export`.
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    ControlError
+        An argument is out of range.
+    FileError
+        The folder cannot be written.
+    """
+    law = runnable(controller)
+    words = _describe(controller, law) | _write_numbers(controller, law, literal(precision), precision)
+    context = {"name": PLAN, "NAME": PLAN.upper(), "precision": precision} | words
+    reads = dict.fromkeys((*controller.further, *controller.signals[1:]))  # as `ReadsLink.reads` has them
+    plan = [f"read_{identifier(name)}" for name in reads]
+    templates, described = _describe_beside(context, controller, law, log_rows, tare, stop, plan)
+    texts = {pattern.format(PLAN): render(template, context | described) for pattern, template in templates.items()}
+    return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+
+
+def _describe_beside(
+    context: Mapping[str, Any],
+    stored: Controller,
+    law: RunnableLaw | RunnableSchedule,
+    log_rows: int | None,
+    tare: Tare | None,
+    stop: Mapping[str, float] | None,
+    plan: list[str] | None = None,
+) -> tuple[dict[str, str], dict[str, Any]]:
+    """Return the templates of what runs beside a law, and their words and numbers. `plan`: of predictive control, what
+    its terms read.
+    """
+    templates, described = dict[str, str](), dict[str, Any](plan=plan)
     if log_rows is not None:
         names = tuple(dict.fromkeys((*stored.signals, *law.further)))
         units, digest = _list_units(stored), hash_law(law, stored.outer)
-        context |= describe_log(context, law, names, log_rows, units=units, digest=digest)
+        described |= describe_log(context, law, names, log_rows, units=units, digest=digest)
         templates |= LOG_TEMPLATES
         if stop is not None:
-            context["stops"] = describe_stops(stop, stored.signals, units, name_unit(stored.command))
+            described["stops"] = describe_stops(stop, stored.signals, units, name_unit(stored.command))
             units |= {stored.command.input: stored.command.unit}
-            context["unwatched"] = describe_unwatched(stop, stored.signals, units)
+            described["unwatched"] = describe_unwatched(stop, stored.signals, units)
             templates |= STAGE_TEMPLATES
     if tare is not None:
         require_type(tare, Tare, "tare", "give a Tare", ControlError)
         unit_after = strip_markup(f" {stored.command.reference_unit}")
-        context |= {"tare": describe_tare(tare, law.sample_time_s), "unit_after": unit_after}
+        described |= {"tare": describe_tare(tare, law.sample_time_s), "unit_after": unit_after}
         templates |= TARE_TEMPLATES
-    texts = {
-        pattern.format(prefix): render(template, context | numbers.get(pattern[-2:], {}))
-        for pattern, template in templates.items()
-    }
-    return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+    return templates, described
 
 
 def _read(controller: Controller | Mapping[str, Any]) -> tuple[Controller, list[str], HeatGuard | None]:

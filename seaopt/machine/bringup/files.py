@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from seaopt.control import ForceMPC, export, export_mpc
+from seaopt.control import ForceMPC, export
+from seaopt.control.deploy.export import export_beside
 from seaopt.control.deploy.target import LOG_ROWS, Tare
+from seaopt.control.mpc.export import collect_code, write_code
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
@@ -127,12 +129,13 @@ def _write_played(expected: Expected, folder: Path, what: str, prefix: str = "")
 
 def _export(stage: Stage, folder: Path, tare: Tare | None, fit_met: bool | None) -> list[Path]:
     source = stage.source
-    if isinstance(source, ForceMPC):
-        return [export_mpc(source, folder)]
     options: dict[str, Any] = {"log_rows": LOG_ROWS, "tare": tare, "stop": stage.stop}
-    if not stage.met:
-        options["uncertified"] = "the certificate of the law of this stage FAILED"
-    return [*export(source, folder, allow_infeasible=True, fit_met=fit_met, **options)]
+    uncertified = "" if stage.met else "the certificate of the law of this stage FAILED"
+    if isinstance(source, ForceMPC):
+        code = write_code(collect_code(source), folder, uncertified=uncertified)
+        return [code, *export_beside(stage.controller, folder, **options)]
+    options |= {"allow_infeasible": True, "fit_met": fit_met, "uncertified": uncertified}
+    return [*export(source, folder, **options)]
 
 
 def _describe(stage: Stage) -> dict[str, Any]:

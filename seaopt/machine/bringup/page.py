@@ -35,6 +35,7 @@ BEGIN = (
     "begin with force_law_init and force_law_reset of what is read at that moment, without which the first command is "
     "a jump by what is read ({}/force_law_stage.c does all of it)"
 )
+BEGIN_PLAN = "begin with force_mpc_reset, at rest and with nothing loaded{} ({{}}/force_mpc_stage.c does all of it)"
 TWO_BANDWIDTHS = (
     "Dry friction makes two bandwidths, of the full law {}: the first where the motor slides, the second in motions so "
     "small that it sticks; what is played lies between."
@@ -220,18 +221,19 @@ def _list_row(stage: Stage) -> tuple[Any, ...]:
 
 def _describe_stage(stage: Stage) -> Section:
     controller = stage.controller
-    source, code = stage.source, "force_mpc.c" if isinstance(stage.source, ForceMPC) else "force_law.c"
+    source, name, begin = stage.source, "force_law", BEGIN
     held = f"Keep {source.over} at {format_number(stage.place)}." if isinstance(source, ScheduledController) else ""
-    begin, ring = BEGIN.format(stage.name), f" ({stage.name}/force_law_log.c does)"
     if isinstance(source, ForceMPC):
-        added = source.compensation is not None or source.link is not None
-        terms = ", call force_mpc_terms before each force_mpc_step" if added else ""
-        begin, ring = f"begin with force_mpc_reset{terms}", ""
+        terms = ", call force_mpc_terms before each step" if source.compensation or source.link else ""
+        ahead = ", give force_mpc_step_ahead the references that follow" if source.spec.preview_samples else ""
+        name, begin = "force_mpc", BEGIN_PLAN.format(terms + ahead)
     sentences = [
         *([held] if held else []),
         *([f"{stage.note[0].upper()}{stage.note[1:]}."] if stage.note else []),
-        f"Flash {stage.name}/{code}, {begin}, play {stage.name}/reference.csv (or reference.c): {_say_played(stage)}",
-        f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)}{ring}.",
+        f"Flash {stage.name}/{name}.c, {begin.format(stage.name)}, play {stage.name}/reference.csv (or reference.c): "
+        f"{_say_played(stage)}",
+        f"Log in each tick, at {1.0 / controller.sample_time_s:g} Hz: {join_words(stage.channels)} "
+        f"({stage.name}/{name}_log.c does).",
         f"Expect: a step of the reference{_say_size(stage)} peaks at {_say_top(stage)} of its size "
         f"({stage.name}/expected_step.csv); the response over frequency is in {stage.name}/expected_tracking.csv.",
         *_say_ran_away(stage),

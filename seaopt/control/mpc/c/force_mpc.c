@@ -70,6 +70,7 @@ void force_mpc_terms(force_mpc *s, real reference, const real *readings) {
   int used = is_number(reference);
   for (int i = 0; i < FORCE_MPC_READINGS; i++) used = used && is_number(readings[i]);
   (void)readings;
+  s->unread = !used;
   if (!used) return;
   real effort = 0;
 #if FORCE_MPC_GRAVITY
@@ -236,10 +237,15 @@ real force_mpc_step_ahead(force_mpc *s, const real *references, int count, real 
   real ahead[STATES], error[PLANT + 1], target[PREVIEW + 1], delta[KNOWN + 1], plan[KNOTS];
   real least, most;
   real innovation = measurement - mpc_offset - dot(mpc_C, s->z, STATES);
-  int used = is_number(measurement);
+  int used = is_number(measurement), lost = !used;
 #if FORCE_MPC_GATE
   used = believed(s, measurement);
+  lost = 0;
 #endif
+#if FORCE_MPC_TERMS
+  lost = lost || s->unread;
+#endif
+  s->held = lost ? s->held + 1 : 0;
   s->status = used ? FORCE_MPC_OK : FORCE_MPC_HELD;
   if (used)
     for (int i = 0; i < STATES; i++) s->z[i] += mpc_gain[i] * innovation;

@@ -21,7 +21,8 @@ typedef struct {
   int age;                        /* samples since a program was solved */
   int iterations;                 /* of the last program; FORCE_MPC_MAX_ITERATIONS at most, whatever the input */
   int status;                     /* FORCE_MPC_OK, _HELD or _FAULT */
-  unsigned long refused;          /* measurements in a row that were not believed */
+  unsigned long held;             /* samples in a row with a reading that is no number; the gate answers in `status` */
+  unsigned long refused;          /* measurements in a row that the gate did not believe */
   force_mpc_real measurement;          /* the last that was */
   int known;                      /* whether there was one */
 #if FORCE_MPC_OUTER
@@ -32,6 +33,7 @@ typedef struct {
   force_mpc_real weight, added;   /* to the references, to the command */
   force_mpc_real before;          /* what was differenced last */
   int differenced;                /* whether there was one */
+  int unread;                     /* whether a reading was no number */
 #if FORCE_MPC_LINK
   double linked[FORCE_MPC_LINK_ORDER]; /* what the filters of the link's motion keep */
   int linked_known;
