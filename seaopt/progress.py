@@ -35,14 +35,8 @@ def ignore(note: str, share: float | None = None, /) -> None:
 
 
 def divide(progress: Progress, *weights: float) -> list[Progress]:
-    """Return the hooks of the parts of a call, one after another, each of which runs from 0 to 1.
-
-    Parameters
-    ----------
-    progress : callable
-        The hook of the whole.
-    *weights : float
-        How long each part takes, in any unit.
+    """Return the hooks of the parts of a call, one after another, each of which runs from 0 to 1. `progress`: the hook
+    of the whole. `weights`: how long each part takes, in any unit.
 
     Examples
     --------

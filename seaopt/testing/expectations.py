@@ -62,12 +62,8 @@ class Expectation:
     judge: Callable[[Stages], Judgement]
 
     def check(self, results: Stages) -> tuple[bool, str]:
-        """Return whether it is met, and a sentence: what was found, what was asked and, if it is not, what to do.
-
-        Parameters
-        ----------
-        results : Stages
-            The problem's.
+        """Return whether the problem's results meet it, and a sentence: what was found, what was asked and, if it is
+        not met, what to do.
         """
         if getattr(results, self.stage) is None:
             fit = results.fit

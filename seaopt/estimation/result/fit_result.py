@@ -13,11 +13,7 @@ from seaopt.codec import Key, OrInfinite, OrNaN, check_agrees, read_fields, to_c
 from seaopt.errors import EstimationError, FileError
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
-from seaopt.estimation.problem.residual_statistics import (
-    ExperimentResiduals,
-    StatisticsByExperiment,
-    compute_residuals,
-)
+from seaopt.estimation.problem.residual_statistics import ExperimentResiduals, StatisticsByExperiment, compute_residuals
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import Covariance
 from seaopt.estimation.result.findings import (
@@ -274,13 +270,7 @@ class Fit(Result, Worded):
         }
 
     def require_minimum(self, what: str) -> Minimum:
-        """Return the minimum, for `what` needs it.
-
-        Raises
-        ------
-        EstimationError
-            The fit was read from a file.
-        """
+        """Return the minimum, for `what` needs it. Raises EstimationError: the fit was read from a file."""
         if self.minimum is None:
             raise EstimationError(f"{what} needs the fit itself, and this one was read from a file; call fit again")
         return self.minimum

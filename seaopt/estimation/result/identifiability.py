@@ -62,13 +62,7 @@ class Identifiability:
 
     def determines(self, slope: Mapping[str, float], values: Mapping[str, float]) -> bool:
         """Tell whether a figure with this slope in the parameters is the same along every direction without effect.
-
-        Parameters
-        ----------
-        slope : mapping of name to float
-            The figure's derivatives.
-        values : mapping of name to float
-            The parameters', to which the directions are relative.
+        `values`: the parameters', to which the directions are relative.
         """
         for direction in self.unidentifiable:
             parts = [slope.get(name, 0.0) * weight * (abs(values[name]) or 1.0) for name, weight in direction.items()]

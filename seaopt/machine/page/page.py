@@ -38,15 +38,7 @@ from seaopt.machine.wording import say_bias, say_cause, say_difference, say_stat
 from seaopt.reporting.page.chart import make_chart
 from seaopt.reporting.page.provenance import describe_provenance
 from seaopt.reporting.page.render import write_result_page
-from seaopt.reporting.sections.data import (
-    Commands,
-    Item,
-    KeyFigure,
-    Mark,
-    Section,
-    Table,
-    mark_met,
-)
+from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Mark, Section, Table, mark_met
 from seaopt.reporting.sections.kinds.controller import explain_sliding, say_bandwidths, show_stuck_bandwidth
 from seaopt.units import unit_after
 

@@ -35,12 +35,7 @@ from seaopt.robustness.certificate.constrained import ConstrainedRuns
 from seaopt.robustness.certificate.friction import MarginDraws
 from seaopt.robustness.certificate.impedance import CertifiedImpedance
 from seaopt.robustness.certificate.requirement import Requirement
-from seaopt.robustness.certificate.scheduled import (
-    find_common_rate,
-    name_rate_unit,
-    state_assumption,
-    state_proof,
-)
+from seaopt.robustness.certificate.scheduled import find_common_rate, name_rate_unit, state_assumption, state_proof
 from seaopt.robustness.certificate.simulated import (
     NAMED_FAULTS,
     SIMULATION_FAILURES,

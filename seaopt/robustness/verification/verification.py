@@ -24,13 +24,7 @@ from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.progress import Progress, ignore
 from seaopt.records import PlotAccessor, Result, Worded, record
 from seaopt.robustness.uncertainty.draws import Plants
-from seaopt.robustness.verification.judgement import (
-    NOMINAL,
-    Outcome,
-    find_differences,
-    judge_run,
-    overshoots_at_limit,
-)
+from seaopt.robustness.verification.judgement import NOMINAL, Outcome, find_differences, judge_run, overshoots_at_limit
 from seaopt.robustness.verification.playback import Playback, Rig, check_planned, play
 from seaopt.robustness.verification.scenarios import Scenario, default_scenarios, list_left_out, make_sticking
 from seaopt.units import Mechanics
