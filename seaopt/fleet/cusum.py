@@ -55,12 +55,6 @@ def _make_chain(threshold: float) -> Float[np.ndarray, "m m"]:
     return chain
 
 
-def average_run_length(threshold: float) -> float:
-    """Return a one-sided chart's mean runs to a false alarm; `threshold`: h, in std."""
-    chain = _make_chain(threshold)
-    return float(np.linalg.solve(np.eye(STATES) - chain, np.ones(STATES))[0])
-
-
 def alarm_probabilities(threshold: float, runs: int) -> VectorN:
     """Return the probabilities that a one-sided chart raises an alarm within 0, 1, ... runs, where nothing has changed.
     `threshold`: h, in standard deviations. `runs`: how many, at most.

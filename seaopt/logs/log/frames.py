@@ -12,7 +12,6 @@ from seaopt.units import bare_name, header_unit, si_unit
 
 if TYPE_CHECKING:
     import pandas as pd
-    import polars as pl
 
 
 def add_headers(log: Recording) -> dict[str, VectorN]:
@@ -21,13 +20,6 @@ def add_headers(log: Recording) -> dict[str, VectorN]:
     for name, signal in log.signals.items():
         columns[f"{name} [{signal.unit}]" if signal.unit else name] = signal.values
     return columns
-
-
-def to_polars(log: Recording) -> pl.DataFrame:
-    """Return a polars frame of a log: see `Log.to_polars`."""
-    import polars as pl
-
-    return pl.DataFrame(add_headers(log))
 
 
 def to_pandas(log: Recording) -> pd.DataFrame:

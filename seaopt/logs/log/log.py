@@ -323,7 +323,9 @@ class Log:
         >>> log.to_polars().columns
         ['time [s]', 'F1 [N]']
         """
-        return frames.to_polars(self)
+        import polars as pl
+
+        return pl.DataFrame(frames.add_headers(self))
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a pandas frame with the columns of `to_polars`. Raises LogError: pandas is not installed."""
