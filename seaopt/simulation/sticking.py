@@ -16,7 +16,7 @@ goes to where a straight line between both velocities passes zero, and for the r
 leaves no velocity at its end: the joint sticks. Where that takes more than F(0), the force is F(0), and the joint
 slides in the other direction. To step with such a constant is Moreau's and Jean's method (Acary and Brogliato,
 Numerical Methods for Nonsmooth Dynamical Systems, 2008); here it is used for no more than the rest of a step in which a
-joint stops.
+joint stops. Where it holds a joint for a whole step, the joint's place is kept as it was.
 
 An output that contains accelerations contains the friction: at a joint that stands still the force that keeps it so.
 """
@@ -90,10 +90,14 @@ def sticking_line_step(plant: Plant) -> ca.Function:
 
     levels = joints.levels(middle, find_input(share), p)
     free, pushed = hold(0.0 * levels), [hold(force) for force in _push_each(levels)]
-    speeds = joints.speeds(free, p)
+    speeds, limits = joints.speeds(free, p), ca.if_else(levels > 0.0, 1.0, 0.0)
     effects = ca.horzcat(*(speeds - joints.speeds(each, p) for each in pushed))
-    forces = _find_holding(speeds, effects, first, ca.if_else(levels > 0.0, 1.0, 0.0))
+    forces = _find_holding(speeds, effects, first, limits)
     stopped = free + ca.mtimes(ca.horzcat(*(each - free for each in pushed)), forces)
+    # One force for a step leaves no velocity at its end, but some within it: what it holds all along does not move.
+    held = first * (share < AT_ONCE) * (ca.fabs(forces) < limits)
+    for state, joint in joints.places:
+        stopped[state] = ca.if_else(held[joint], x[state], stopped[state])
     return ca.Function("step", [t, x, u0, u1, p, length], [ca.densify(ca.if_else(ca.mmax(stops), stopped, end))])
 
 
@@ -159,6 +163,12 @@ class _Joints:
         self.rate = ca.Function("rate", arguments, [f])
         self.read = ca.Function("read", arguments, [h])
         self.accelerate = ca.Function("accelerate", arguments, [ca.jtimes(speeds, plant.x, f)])
+        self.places = [
+            (state, joint)
+            for state, rate in enumerate(ca.vertsplit(f))
+            for joint, speed in enumerate(velocities)
+            if _moves_with(rate, speed, plant.x)
+        ]
 
     def slide(self, x: Any, u: Any, p: Any, signs: Any) -> Any:
         """Return the forces of joints that slide in the directions `signs`."""
@@ -178,6 +188,18 @@ class _Joints:
         spaces = name_symbols(self.plant, x, u, p)
         pairs = zip(self.jumps, ca.vertsplit(speeds), strict=True)
         return ca.vertcat(*(ca.SX(jump(speed, add_loads(*spaces))) for (jump, add_loads), speed in pairs))
+
+
+def _moves_with(rate: Any, speed: Any, x: Any) -> bool:
+    """Tell whether a state's rate is in proportion to a joint's speed: both are to the same one state."""
+    needed = [ca.which_depends(each, x, 1) for each in (rate, speed)]
+    if needed[0] != needed[1] or sum(needed[0]) != 1:
+        return False
+    alone = x[needed[0].index(True)]
+    return all(
+        not any(ca.which_depends(each, alone, 2)) and ca.substitute(each, alone, 0.0).is_zero()
+        for each in (rate, speed)
+    )
 
 
 def _push_each(levels: Any) -> list[Any]:

@@ -333,7 +333,7 @@ def test_a_motor_that_friction_holds_against_its_cogging_stands_still():
 
 def test_a_motor_that_friction_holds_while_its_current_rises_stands_still():
     """The push changes within a sample and stays below the friction, so that nothing moves. A step holds it with one
-    constant force, which lets it creep by the square of the step: no reason to halve that until it is rounding.
+    constant force, which leaves a velocity within the step: the place is kept all the same.
     """
     plant = so.plants.rotary(link="locked", parts=("current_loop",))
     params = plant.defaults.update(current_loop_hz=400.0, f_c=0.05, K_tau=0.06)
@@ -341,9 +341,9 @@ def test_a_motor_that_friction_holds_while_its_current_rises_stands_still():
     loop = SampledLoop(plant=plant, law=runnable(controller), measured="tau_s", delay_samples=1, sticks=True)
     reference = 0.1 * 0.05 * 50.0 * np.sin(2 * np.pi * 1.5 * TS * np.arange(300))
     run = run_loop(loop, [params], reference)
-    pushed = 0.06 * np.max(np.abs(run.current))  # N m; without friction it turns the motor by so much in a sample:
+    pushed = 0.06 * np.max(np.abs(run.current))  # N m
     assert 0.0 < pushed < 0.05
-    assert np.max(np.abs(run.states[..., list(plant.states).index("theta_m")])) < 1e-3 * 0.5 * pushed / 1e-4 * TS**2
+    assert np.max(np.abs(run.states[..., list(plant.states).index("theta_m")])) == 0.0
     assert run.substeps < 50
 
 
