@@ -122,7 +122,8 @@ def test_a_machine_with_a_fault_is_refused_and_the_fault_named(compiler, stage, 
     result = so.accept(law, [so.read_log(play(compiler, stage, **fault)[2]).between(0.0, CUT)])
     found = result.differences.found[0]
     assert result.replayed and not result.met, result
-    assert found.kind == ("delay" if "LATE" in fault else "parameter") and found.value == pytest.approx(size, rel=0.03)
+    assert found.kind == "delay" if "LATE" in fault else {"gain", "K_tau"} & {found.name, *found.alike}, found
+    assert found.value == pytest.approx(size, rel=0.03)
 
 
 def test_a_sign_that_is_turned_stops_the_stage_and_is_said(compiler, stage, plan):
