@@ -40,8 +40,8 @@ from seaopt.robustness.certificate.requirement import (
     Spot,
     require_at_most,
 )
-from seaopt.robustness.uncertainty.agreement import GRACE, Agreement
-from seaopt.robustness.uncertainty.logs import CONTRADICT, LogVerdict, judge_log
+from seaopt.robustness.uncertainty.agreement import Agreement
+from seaopt.robustness.uncertainty.logs import CONTRADICT, GRACE, LogVerdict, judge_log
 from seaopt.robustness.uncertainty.plant_margins import plant_margins
 from seaopt.robustness.verification.large_signal import SLOWEST_STUCK, predict_bandwidths
 from seaopt.robustness.verification.scenarios import STEP_SHARES

@@ -15,8 +15,7 @@ What a model leaves besides noise is in part its own error, a share :math:`1 - 1
 has some 80 independent values in however many samples N (`seaopt.estimation.result.model_error`): hence
 :math:`w = 1 + (1 - 1/x^2) N/80`. A log of another actuator widens excess and intervals, fitted or compared with the
 fit's own, so that they count up to what a fit that is met may have: an excess of 1.5, and 20 % of a value in that
-minimum where noise alone makes less. And an error of up to 5 % of :math:`|1 + L|` counts for nothing: it moves the
-sensitivity by less than the grace that Ms has, as the next day does with most actuators.
+minimum where noise alone makes less.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ from seaopt.frequency.residual import ALIKE
 from seaopt.frequency.response import ComplexLines, Lines
 from seaopt.records import record
 
-GRACE = 0.05  # an actuator is not its model to the last digit
 Moves = Complex[np.ndarray, "k m"]  # of a loop's gain, by a std along each axis of the covariance
 
 
@@ -43,7 +41,7 @@ class Agreement:
 
     misfit: float  # mean square of what the model leaves and its intervals do not explain, over that of noise
     allowed: float  # what chance makes of it, but for the risk
-    off: float  # the model's error over |L| or |1 + L|, whichever is larger, at the line that says most,
+    off: float  # the model's error over |L| or |1 + L|, whichever is larger, at the line where most of it is no noise
     off_hz: float
 
     @property
@@ -68,15 +66,17 @@ def judge_agreement(
     """
     from scipy.special import fdtri  # deferred: 0.1 s
 
-    away = np.abs(1.0 + loop)
-    beyond = np.maximum(np.abs(error) - unseen - GRACE * away, 0.0)
+    beyond = np.maximum(np.abs(error) - unseen, 0.0)
     left = np.divide(beyond, std, out=np.zeros_like(beyond), where=beyond > 0.0)
-    at, pairs = int(np.argmax(left)), 2.0 * error.size / ALIKE
+    pairs = 2.0 * error.size / ALIKE
     z = _split(left * np.exp(1j * np.angle(error)))
     misfit, allowed = float(z @ z) / pairs, float(fdtri(pairs, pairs * freedom, 1.0 - 0.5 * alpha))
     if misfit > allowed:
         misfit -= _explain(z, _split(move() / std), alpha) / pairs
-    off = np.abs(error[at]) / max(np.abs(loop[at]), away[at], 1e-300)
+    size = np.maximum(np.maximum(np.abs(loop), np.abs(1.0 + loop)), 1e-300)
+    radius = std * math.sqrt(freedom * math.expm1(-math.log(alpha / error.size) / freedom))
+    at = int(np.argmax((beyond - radius) / size))
+    off = np.abs(error[at]) / size[at]
     return Agreement(misfit=misfit, allowed=allowed, off=float(off), off_hz=float(f[at]))
 
 

@@ -49,9 +49,10 @@ from seaopt.logs.quality.faults import find_runs
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import has_friction
 from seaopt.records import record
-from seaopt.robustness.uncertainty.agreement import GRACE, Agreement, find_radius, judge_agreement, widen_by_model
+from seaopt.robustness.uncertainty.agreement import Agreement, find_radius, judge_agreement, widen_by_model
 from seaopt.simulation import Clock, linearise, make_model
 
+GRACE = 0.05  # of Ms: an actuator is not its model to the last digit
 REFUTE, CONFIRM, CONTRADICT = 0.01, 0.05, 0.01  # the risk of a false statement: on the law, twice, and on the model
 EACH = CONTRADICT / LENGTHS  # of the last, of windows of one length
 LARGEST_DISC = 0.5  # of the distance from zero: where discs are larger, the log says nothing

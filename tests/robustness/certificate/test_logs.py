@@ -18,8 +18,8 @@ from seaopt.problem.stages import certify_problem
 from seaopt.robustness.certificate.limits import describe_log
 from seaopt.robustness.certificate.requirement import LOG_AGREEMENT, LOG_SENSITIVITY
 from seaopt.robustness.certificate.simulated import STEPS
-from seaopt.robustness.uncertainty.agreement import GRACE, judge_agreement, widen_by_model
-from seaopt.robustness.uncertainty.logs import CONTRADICT, SilentLog, judge_log
+from seaopt.robustness.uncertainty.agreement import judge_agreement, widen_by_model
+from seaopt.robustness.uncertainty.logs import CONTRADICT, GRACE, SilentLog, judge_log
 from tests.checks import leave_out
 
 RATE, SECONDS, MODE_HZ, ZETA, NOISE = 1000.0, 20.0, 40.0, 0.02, 2.0
@@ -379,7 +379,7 @@ def test_log_of_another_actuator_fails_by_name_where_no_sensitivity_is_asked(jud
     assert rows_of(certificate) == [] and not certificate.met
 
 
-def test_right_log_and_one_that_is_off_by_less_than_the_grace_agree_and_risks_add_up(judge_slow):
+def test_right_log_and_one_whose_gain_is_within_the_intervals_agree_and_risks_add_up(judge_slow):
     certificate = judge_slow(validate=[{"seed": 2}, {"seed": 3, "gain": 0.97}, {"seed": 4, "amplitude": 1.0}])
     rows = rows_of(certificate, LOG_AGREEMENT)
     assert len(rows) == 4 and all(row.met for row in rows)
