@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from seaopt.estimation.judgement.hypothesis_search import TriedHypotheses
+from seaopt.estimation.judgement.hypothesis_ranking import TriedHypotheses
 from seaopt.robustness.certificate import certify
 from seaopt.robustness.certificate.cases import Check
 

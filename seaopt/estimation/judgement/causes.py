@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.candidates import Candidate, list_candidates
-from seaopt.estimation.judgement.hypothesis_search import Refit
+from seaopt.estimation.judgement.hypothesis_ranking import Refit
 from seaopt.estimation.judgement.score_test import ScoreTest
 from seaopt.estimation.judgement.second_log import FAR
 from seaopt.estimation.problem.experiment import Experiment

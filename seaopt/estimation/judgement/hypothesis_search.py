@@ -27,6 +27,15 @@ import numpy as np
 
 from seaopt.errors import SeaoptError
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES, Change, Hypothesis, change_plants, measure_sizes
+from seaopt.estimation.judgement.hypothesis_ranking import (
+    ASKS,
+    HALF,
+    NEARLY,
+    REMOVED,
+    Refit,
+    TriedHypotheses,
+    rank_refits,
+)
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import (
     BudgetError,
@@ -41,7 +50,6 @@ from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment,
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
-from seaopt.estimation.result.trials import HypothesisTrial, Outcome, spell_parameters, spell_parts
 from seaopt.estimation.solver.budget import EvaluationBudget
 from seaopt.estimation.solver.least_squares import FIRST_RADIUS, find_blocked, minimise
 from seaopt.estimation.solver.settle import ROUGH_SUBSTEPS, coarsen, estimate_sigma
@@ -49,98 +57,17 @@ from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.estimation.solver.step_size import choose_first_steps, has_bristles, hold_bristles, refine_bristles
 from seaopt.parameters import ParameterSet
 from seaopt.progress import Progress, ignore
-from seaopt.records import record
 
-ASKS = 1.5  # times its noise a residual is before anything is looked for
-REMOVED = 3.0  # times its noise that a hypothesis may leave
-NEARLY = 1.0 / 7.0  # of the excess that it may leave besides: 98 % of the power is removed
-HALF = 0.5  # of the excess power that one has to take
-TIED = 1.05  # times the least excess, up to which hypotheses are as good
 ROUND, ROUNDS = 4, 5  # iterations of a refit between two looks at whether it helps, and how many looks
 MOST_ROUNDS = 15  # where each of them halves the power that is left
 HELPS = 0.02  # of a residual's power beyond noise, that a round has to take from some output
-CHANCE = 10.0  # of log-likelihood, over the colour of the residual, that chance may give
-UNDECIDED = 5.0  # of it, from which a refit near noise is neither chance nor sure
 CLOSE = 1e-3  # over the size of the start: the second radius that a step may have
 BASES = 3  # hypotheses, the best, beside which each other one is tried
 BACK = 1e-3  # of a residual's power, beyond the least yet, from which a refit is on its way back to it
 SLIGHT = 0.2  # of that: a step that may gain half as much ends a round
 NEAR = 1e-2  # squared standard deviations that may be left to the minimum
-LEFT = 1.0  # of them, from which a refit says only that something is missing, and not how far it moves the values
 
 P = ParamSpec("P")
-
-
-@record(eq=False)
-class Refit:
-    """A minimum with one or two hypotheses, near enough to be compared."""
-
-    change: Change
-    problem: FitProblem
-    evaluation: Evaluation
-    excess: float
-    gain: float  # logarithm of its likelihood over the fit's
-    evaluations: int
-    undecided: bool = False  # whether it was left because its steps were out of proportion
-
-    @property
-    def values(self) -> dict[str, float]:
-        """The unknowns at the minimum."""
-        return self.problem.unknowns.by_name(self.evaluation.z)
-
-    @property
-    def at_minimum(self) -> bool:
-        """Whether it has come so near to its minimum that its values are those that the hypothesis gives."""
-        unknowns = self.problem.unknowns
-        free = ~find_blocked(self.evaluation, unknowns.low, unknowns.high)
-        return self.evaluation.distance_squared(free) <= LEFT
-
-    @property
-    def frees(self) -> dict[str, float]:
-        """What its parts free, with values."""
-        searched = {name for hypothesis in self.change.hypotheses for name in hypothesis.searched}
-        return {name: self.values[name] for name in self.change.frees if name not in searched}
-
-    @property
-    def fixed(self) -> dict[str, float]:
-        """What is chosen for its parts, with values."""
-        return {
-            **{name: self.values[name] for name in self.change.frees if name not in self.frees},
-            **self.change.fixed,
-        }
-
-    @property
-    def proposal(self) -> str:
-        """The lines of a problem file that add its parts to a plant NAME, with their parameters."""
-        recipe = self.change.experiments[0].plant.recipe
-        parts = spell_parts((*(recipe.parts if recipe else ()), *self.change.parts))
-        return "\n".join(["[plant.NAME]", *parts, "[parameters]", *spell_parameters(self.frees, self.fixed)])
-
-    @property
-    def python(self) -> str:
-        """The calls that add them to a plant and its parameters."""
-        given = ", ".join(f"{name}={value:g}" for name, value in {**self.frees, **self.fixed}.items())
-        free = ", ".join(f'"{name}"' for name in self.frees)
-        lines = [f'plant = so.plants.add_part(plant, "{part}")' for part in self.change.parts]
-        lines += [f"params = plant.defaults.with_parameters(*params.values()).update({given}).free({free})"]
-        return "\n".join(lines)
-
-
-@record(eq=False)
-class TriedHypotheses:
-    """What was tried: the hypotheses that remove the excess, those as good as the best, and a row for each."""
-
-    able: tuple[Refit, ...] = ()
-    trials: tuple[HypothesisTrial, ...] = ()
-    # All unknowns of a refit that removes a large excess in part, or of one that chance hardly makes so likely: where
-    # none is able, the truth is as near to it as to the fit.
-    partial: Mapping[str, float] | None = None
-    ended: bool = False  # by its budget, before all was tried
-
-    def yield_to_another(self) -> TriedHypotheses:
-        """Return the search where another cause explains the logs better, so that none is adopted."""
-        rows = (replace(row, outcome="tied") if row.outcome == "adopted" else row for row in self.trials)
-        return replace(self, trials=tuple(rows))
 
 
 def search_hypotheses(
@@ -162,7 +89,7 @@ def search_hypotheses(
     if (first <= ASKS and not doubtful) or minimum.problem.predicts:
         return TriedHypotheses()
     search = _Search(fit, minimum, first, budget, progress)
-    judged = _judge(search.run(), first, measure_colour(fit.covariance, fit.white_covariance))
+    judged = rank_refits(search.run(), first, measure_colour(fit.covariance, fit.white_covariance))
     return replace(judged, ended=search.ended)
 
 
@@ -527,72 +454,3 @@ def _measure_gain(before: Evaluation, after: Evaluation) -> float:
     powers = (np.maximum(_measure_powers(each), 1e-300) for each in (before, after))
     was, left = powers
     return 0.5 * float(np.sum(counts * (np.log(was) - np.log(left))))
-
-
-def _takes_half(before: float, after: float) -> bool:
-    """Tell whether a refit takes half of the excess power; of noise alone there is none."""
-    return after**2 - 1.0 <= HALF * (before**2 - 1.0)
-
-
-def _judge(refits: Sequence[Refit], first: float, colour: float) -> TriedHypotheses:
-    """Return what became of each hypothesis, the best first: of those as good the one with the fewest unknowns.
-    `first`, `colour`: of the fit, its excess and how many times more than for white residuals its estimates vary.
-    """
-    single = [refit for refit in refits if len(refit.change.hypotheses) == 1 and not refit.undecided]
-    best_single = min((refit.excess for refit in single), default=np.inf)
-    # Two effects are taken where one leaves an excess, and the other takes half of that; where one would do, all of it.
-    most = max(REMOVED, NEARLY * first)
-    most_of_pair = most if best_single > most else ASKS
-    # A delay alone is an experiment's own, which other causes name: what leaves more than it does explains nothing.
-    late = [refit for refit in single if refit.change.hypotheses[0].dead_time is not None]
-    least_late = min((refit.excess for refit in late), default=np.inf)
-    able = [
-        refit
-        for refit in refits
-        if refit.excess <= min(most, TIED * least_late)
-        and refit not in late
-        and not refit.undecided
-        and (_takes_half(first, refit.excess) if first > ASKS else refit.gain > CHANCE * colour)
-        and (refit in single or (refit.excess <= most_of_pair < best_single and _takes_half(best_single, refit.excess)))
-    ]
-    least = min((refit.excess for refit in able), default=np.inf)
-    tied = [refit for refit in able if refit.excess <= TIED * least]
-    if least <= ASKS:  # what is left is noise, and tells them apart
-        best = max(refit.gain for refit in tied)
-        tied = [refit for refit in tied if refit.gain >= best - CHANCE * colour]
-    tied.sort(key=lambda refit: (refit.evaluation.z.size, refit.excess))
-    others = [refit for refit in refits if refit not in tied]
-    others.sort(key=lambda refit: (refit.undecided, refit.excess))
-    left: list[Outcome] = ["undecided" if refit.undecided else "tried" for refit in others]
-    outcomes: list[Outcome] = [*["adopted" for _ in tied[:1]], *["tied" for _ in tied[1:]], *left]
-    ranked = [*tied, *others]
-    trials = tuple(_state(refit, outcome, first) for refit, outcome in zip(ranked, outcomes, strict=True))
-    return TriedHypotheses(
-        able=tuple(tied), trials=trials, partial=None if able else find_partial(refits, first, colour)
-    )
-
-
-def find_partial(refits: Sequence[Refit], first: float, colour: float) -> Mapping[str, float] | None:
-    """Return the values of the refit that is as near to the truth as the fit; None where there is no such refit."""
-    if first > REMOVED:
-        best = min(refits, key=lambda refit: refit.excess, default=None)
-        return best.values if best is not None and best.excess < first else None
-    best = max(refits, key=lambda refit: refit.gain, default=None)
-    return best.values if best is not None and best.gain > UNDECIDED * colour and first <= ASKS else None
-
-
-def _state(refit: Refit, outcome: Outcome, first: float) -> HypothesisTrial:
-    change = refit.change
-    return HypothesisTrial(
-        effect=change.effect,
-        parts=change.parts,
-        outcome=outcome,
-        excess_before=first,
-        excess=refit.excess,
-        frees=refit.frees,
-        fixed=refit.fixed,
-        parameters={name: refit.values[name] for name in refit.problem.shared_names},
-        evaluations=refit.evaluations,
-        proposal=refit.proposal,
-        python=refit.python,
-    )

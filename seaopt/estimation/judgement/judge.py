@@ -23,7 +23,8 @@ from seaopt.estimation.judgement.another_start import find_other_minimum
 from seaopt.estimation.judgement.causes import Explanation, find_causes
 from seaopt.estimation.judgement.coherence import CoherentShare, measure_coherence
 from seaopt.estimation.judgement.command_rate import find_unlogged_command
-from seaopt.estimation.judgement.hypothesis_search import ASKS, REMOVED, TriedHypotheses, search_hypotheses
+from seaopt.estimation.judgement.hypothesis_ranking import ASKS, REMOVED, TriedHypotheses
+from seaopt.estimation.judgement.hypothesis_search import search_hypotheses
 from seaopt.estimation.judgement.intervals import (
     find_excesses,
     find_rough,

@@ -14,7 +14,7 @@ import seaopt as so
 from seaopt.errors import EstimationError
 from seaopt.estimation.judgement import hypothesis_search
 from seaopt.estimation.judgement.hypotheses import HYPOTHESES
-from seaopt.estimation.judgement.hypothesis_search import ASKS, NEARLY, REMOVED, Refit, find_partial
+from seaopt.estimation.judgement.hypothesis_ranking import ASKS, NEARLY, REMOVED, Refit, find_partial
 from seaopt.estimation.judgement.intervals import find_rough
 from seaopt.estimation.result.model_error import ModelError
 from seaopt.estimation.result.widening import widen
@@ -251,7 +251,7 @@ def test_intervals_reach_to_what_is_named_beside_values_that_stay(monkeypatch):
     for name in FREE:
         parameter, there = result.parameters[name], result.hypotheses[0].parameters[name]
         assert abs(there - parameter.value) <= 1.001 * parameter.total_std
-    monkeypatch.setattr("seaopt.estimation.judgement.hypothesis_search.LEFT", -1.0)
+    monkeypatch.setattr("seaopt.estimation.judgement.hypothesis_ranking.LEFT", -1.0)
     assert [error.kind for error in fit(log).errors] == ["cause"]
 
 
