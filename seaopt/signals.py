@@ -28,6 +28,7 @@ HOLDING_NAMES = frozenset({"duty", "goal"})  # of inputs that hold a value for a
 INPUT_UNITS = frozenset({"A", "V"})
 SAME_SIGN = ("f1", "f2")  # both forces of an actuator between two links
 REFERENCE = "reference"  # of a law, in a log that was taken under it
+HOLDS = "holds"  # of a log whose command firmware takes only at some samples: above zero at the others
 STATUS = "status"  # of the law, as its C has it
 TARGET_LOG = "SEALOG1"  # with which a log begins that the C beside a law writes
 REFERENCES = (REFERENCE, "ref")  # what its column is called where nobody says

@@ -53,7 +53,7 @@ PARTS = (
     "spring_damping", "screw_mode", "droop", "falling_torque", "friction_drift", "friction_direction", "back_driving",
     "cogging", "stand", "current_loop", "load_cell", "sensor_filter", "command_delay",
     "measurement_delay", "voltage_input", "duty_input", "supply_input", "supply_sag", "inductance", "position_servo",
-    "servo_integral", "servo_limit", "servo_hold", "servo_delay", "deflection_sensor", "thermal",
+    "servo_integral", "servo_limit", "servo_hold", "servo_sample", "servo_delay", "deflection_sensor", "thermal",
 )  # fmt: skip
 OVERRIDES = FrozenDict({Literal[choices]: str for choices in (*CHOICES, PARTS)})
 checker = ModuleType("seaopt_type_checker")

@@ -27,6 +27,9 @@ Parts around any plant:
     The firmware reads its position every T_h and holds c in between, so that c is of what it read T_h/2 ago on average;
     the goal is late by the log's delay alone. To first order that is
     :math:`c = g_s (k_p (\mathrm{goal} - \theta + T_h \dot\theta / 2) - k_d \dot\theta)`: damping is taken away.
+``servo_sample``
+    The firmware computes c of what it reads at those samples of the log at which the input `holds` is zero, and holds
+    it in between; the goal has to stand as long, as `Log.hold` makes it. Without `holds` it reads at every sample.
 ``servo_delay``
     c acts T_v late, the goal in it too. A servo that runs at a rate f and takes T to compute acts as late as a delay of
     :math:`T + 1/(2 f)`.
@@ -46,8 +49,9 @@ from seaopt.errors import PlantError
 from seaopt.parameters import Parameter, declare
 from seaopt.plants.motor.thermal import RESISTANCE, find_resistance
 from seaopt.plants.plant import Plant, refuse_clash
-from seaopt.plants.roles import Actuation, Port, change_ports, put_behind, with_values
+from seaopt.plants.roles import Actuation, Port, Sampling, change_ports, put_behind, with_values
 from seaopt.records import record
+from seaopt.signals import HOLDS
 
 PARTS: dict[str, tuple[Parameter, ...]] = {
     "voltage_input": (RESISTANCE,),
@@ -61,6 +65,7 @@ PARTS: dict[str, tuple[Parameter, ...]] = {
         declare("g_s", 1.0, "-", 0.0, "command of one unit of gain and error"),
     ),
     "servo_integral": (declare("k_i", 0.0, "1/s", 0.0, "integral gain of the servo"),),
+    "servo_sample": (),
     "servo_hold": (declare("T_h", 0.0, "s", 0.0, "sample time of the servo's firmware"),),
     "servo_limit": (declare("c_max", 1.0, "-", 0.0, "limit of the servo's command"),),
 }
@@ -89,6 +94,7 @@ class _DriveEquations:
     effort: Callable[[Any], Any]  # of the parameters: what one unit of the new input is of the plant's, at rest
     largest: Callable[[Any], Any] | None = None  # of the new input
     optional: Mapping[str, str] = field(default_factory=dict[str, str])  # further inputs, zero where a log has none
+    sampling: Sampling | None = None  # of its own states
 
 
 def drive_electrically(plant: Plant, parts: Collection[str]) -> Plant:
@@ -163,11 +169,19 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
             "sensing = Sensing(regulated, motor_position=..., motor_speed=...)",
             plant=plant.name,
         )
+    sampled, read = "servo_sample" in parts, {name: f"{name}_read" for name in (position, rate) if name}
+    if sampled and ("servo_hold" in parts or not read.keys() <= plant.states.keys()):
+        raise PlantError(
+            'part "servo_sample" needs a position, and a speed beside it if there is one, that are states, and goes '
+            'without "servo_hold", which is roughly what it does',
+            plant=plant.name,
+        )
     source = next(iter(plant.inputs))
     integral, limited = "servo_integral" in parts, "servo_limit" in parts
     commanded = {} if source in plant.outputs else {source: plant.inputs[source]}  # a log may hold it, too
 
     def solve(t: Any, x: Any, u: Any, p: Any) -> _Solved:
+        x = with_values(x, {name: getattr(x, kept) for name, kept in read.items()}) if sampled else x
         reading = getattr(x, position, None)
         error = u.goal - (plant.h(t, x, with_values(u, {source: 0.0}), p)[position] if reading is None else reading)
         error += 0.5 * p.T_h * getattr(x, rate) if "servo_hold" in parts and rate else 0.0
@@ -177,23 +191,29 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
         winds_up = ca.logic_and(limited_command != command, command * error > 0.0)
         return (
             limited_command,
-            {"error_sum": ca.if_else(winds_up, 0.0, error)} if integral else {},
+            {
+                **({"error_sum": ca.if_else(winds_up, 0.0, error)} if integral else {}),
+                **(dict.fromkeys(read.values(), 0.0) if sampled else {}),
+            },
             dict.fromkeys(commanded, limited_command),
         )
 
     added = [parameter for part in SERVO if part in parts for parameter in PARTS[part]]
     unit = plant.outputs.get(position) or plant.states[position]
+    states = {kept: plant.states[name] for name, kept in read.items()} if sampled else {}
     return _put_before(
         plant,
         _DriveEquations(
             name="position_servo",
             input="goal",
             unit=unit,
-            states={"error_sum": f"{unit} s"} if integral else {},
+            states={**({"error_sum": f"{unit} s"} if integral else {}), **states},
             outputs=commanded,
             parameters=tuple(parameter for parameter in added if rate or parameter.name != "k_d"),
             solve=solve,
             effort=lambda p: p.g_s * p.k_p,
+            optional={HOLDS: "-"} if sampled else {},
+            sampling=Sampling(reads={kept: name for name, kept in read.items()}, kept_by=HOLDS) if sampled else None,
         ),
         change_ports(plant.ports, add_servo, tuple(parts)),
     )
@@ -245,6 +265,7 @@ def _put_before(plant: Plant, drive: _DriveEquations, ports: tuple[Port, ...]) -
         outputs={**plant.outputs, **drive.outputs},
         optional_inputs=frozenset((*optional, *drive.optional)),
         parameters={**plant.parameters, **added},
+        sampling=drive.sampling or plant.sampling,
         friction=put_behind(plant.friction, lambda x, u, p: solve_inside(0.0, x, u, p)[0]),
         ports=ports,
     )

@@ -97,7 +97,7 @@ Part = Literal[
     "spring_damping", "screw_mode", "droop", "falling_torque", "friction_drift", "friction_direction", "back_driving",
     "cogging", "stand", "current_loop", "load_cell", "sensor_filter", "command_delay",
     "measurement_delay", "voltage_input", "duty_input", "supply_input", "supply_sag", "inductance", "position_servo",
-    "servo_integral", "servo_limit", "servo_hold", "servo_delay", "deflection_sensor", "thermal",
+    "servo_integral", "servo_limit", "servo_hold", "servo_sample", "servo_delay", "deflection_sensor", "thermal",
 ]  # fmt: skip
 
 SHARPNESS = declare("n_h", 1.0, "-", 1.0, "how much at once it gives way, an exponent")
@@ -163,7 +163,9 @@ BREAKAWAY = 1.5  # of Coulomb friction, where bristles need a default
 # What a part needs beside it: one part of each group.
 NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
     **dict.fromkeys(("load_stribeck", "load_square"), (("stribeck",), ("load_friction",))),
-    **dict.fromkeys(("servo_integral", "servo_limit", "servo_hold", "servo_delay"), (("position_servo",),)),
+    **dict.fromkeys(
+        ("servo_integral", "servo_limit", "servo_hold", "servo_sample", "servo_delay"), (("position_servo",),)
+    ),
     **dict.fromkeys(("supply_input", "supply_sag"), (("duty_input",),)),
     "inductance": (tuple(drives.INPUTS),),
 }

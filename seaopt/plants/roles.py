@@ -299,15 +299,20 @@ class Recipe:
 class Sampling:
     """States that stand still between samples, and are set at each: memories of a device that samples."""
 
-    period_s: float  # between samples; such a plant is simulated with this period alone
+    period_s: float | None = None  # between samples, the only one that such a plant is simulated with; None: any
     # what each becomes after a sample: a combination of states as they were at the sample
-    sets: Mapping[str, Mapping[str, float]]
+    sets: Mapping[str, Mapping[str, float]] = field(default_factory=dict[str, Mapping[str, float]])
     differences: Mapping[str, Any] = field(default_factory=dict[str, Any])  # the speeds that these memories are for
+    # states that a device reads, by the states that have what it read: anew at each sample at which the input that is
+    # `kept_by` is zero, before it acts
+    reads: Mapping[str, str] = field(default_factory=dict[str, str])
+    kept_by: str = ""
 
     def matrix(self, states: Sequence[str]) -> tuple[list[int], Float[np.ndarray, "m nx"]]:
         """Return which states are set, and their combinations of all."""
         rows = [list(states).index(name) for name in self.sets]
-        return rows, np.array([[weights.get(name, 0.0) for name in states] for weights in self.sets.values()])
+        weights = [[weights.get(name, 0.0) for name in states] for weights in self.sets.values()]
+        return rows, np.array(weights).reshape(len(rows), len(states))
 
 
 @record

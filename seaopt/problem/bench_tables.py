@@ -244,6 +244,13 @@ class ResampleTable(StrictTable):
     bridge_s: Number | None = key("Longest step of time that is interpolated across.", default=None, gt=0)
 
 
+class HeldTable(StrictTable):
+    """A command that firmware takes only every few rows of the log, which it then holds."""
+
+    samples: Whole = key("Over how many rows each value stands.", ge=1, le=10_000)
+    first: Whole = key("A row at which one is taken, counted from 0, of the log as it is used.", default=0, ge=0)
+
+
 class LogTable(StrictTable):
     """A log, or a virtual one, of one plant: how it is read, and what only a file says of it."""
 
@@ -267,6 +274,9 @@ class LogTable(StrictTable):
         '"restamp" for rounded timestamps; a rate for uneven ones.', default=None
     )
     decimate: Whole = key("Keep every n-th sample, behind a filter.", default=1, ge=1, le=10_000)
+    held: HeldTable | None = key(
+        "The plant's command is taken every so many rows; part servo_sample reads the position with it.", default=None
+    )
     parameters: dict[str, Number | UnknownTable | ColumnTable] = key(
         "Values, or free ones, of this log alone.", default={}
     )

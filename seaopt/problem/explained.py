@@ -10,7 +10,7 @@ from seaopt.documents import check_table
 from seaopt.errors import ProblemError
 from seaopt.estimation import Fit
 from seaopt.estimation.judgement.second_log import FAR
-from seaopt.estimation.result.trials import HypothesisTrial, state_sticking
+from seaopt.estimation.result.trials import HypothesisTrial, spell_hold, state_sticking
 from seaopt.problem.problem import Problem
 from seaopt.problem.reading import make_problem
 from seaopt.problem.schema import ProblemTable
@@ -32,7 +32,8 @@ def say_unexplained(trials: Sequence[HypothesisTrial]) -> str:
         return "nothing was tried: no residual asks for more than the model has, or it explains too little"
     as_good = [trial for trial in trials if trial.outcome in ("adopted", "tied")]
     if as_good:
-        effects = "; or ".join(f"{trial.effect} ({', '.join(trial.parts)})" for trial in as_good)
+        named = ((trial, ", ".join((*trial.parts, *(["held"] if trial.holds else [])))) for trial in as_good)
+        effects = "; or ".join(f"{trial.effect} ({names})" for trial, names in named)
         return f"nothing is added, for several causes explain the logs: {effects}; add the one you expect"
     decided = [trial for trial in trials if trial.outcome != "undecided"]
     left = [trial.effect for trial in trials if trial.outcome == "undecided"]
@@ -74,7 +75,7 @@ def adopt(problem: Problem, trial: HypothesisTrial, starts: Collection[str] = ()
     content = problem.table.model_dump(by_alias=True, exclude_unset=True, mode="json")
     fitted = [table.plant for table in problem.table.experiment if table.use == "fit"]
     lines: list[str] = []
-    for name in dict.fromkeys(fitted):
+    for name in dict.fromkeys(fitted) if trial.parts else ():
         plant = content["plant"][name]
         plant["parts"] = list(dict.fromkeys([*plant.get("parts", []), *trial.parts]))
         listed = ", ".join(f'"{part}"' for part in plant["parts"])
@@ -85,11 +86,16 @@ def adopt(problem: Problem, trial: HypothesisTrial, starts: Collection[str] = ()
         **{name: _round(value) for name, value in trial.fixed.items()},
     }
     content["parameters"] = {**content.get("parameters", {}), **values}
-    lines += ["[parameters]", *(f"{name} = {_write(value)}" for name, value in values.items())]
+    if values:
+        lines += ["[parameters]", *(f"{name} = {_write(value)}" for name, value in values.items())]
     for experiment, row in zip(problem.table.experiment, content["experiment"], strict=True):
-        if experiment.name in starts:
-            row["initial_state"] = "estimate"
-            lines += ["[[experiment]]", f'name = "{experiment.name}"', 'initial_state = "estimate"']
+        changed = ['initial_state = "estimate"'] if experiment.name in starts else []
+        row |= {"initial_state": "estimate"} if changed else {}
+        if experiment.name in trial.holds:
+            samples, first = trial.holds[experiment.name]
+            row["held"] = {"samples": samples, "first": first}
+            changed.append(spell_hold(trial.holds[experiment.name]))
+        lines += ["[[experiment]]", f'name = "{experiment.name}"', *changed] if changed else []
     table = check_table(ProblemTable, content, problem.source, error=ProblemError)
     made = make_problem(table, problem.source, problem.folder)
     start = {name: value for name, value in trial.parameters.items() if name in made.parameters}

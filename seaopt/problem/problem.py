@@ -286,7 +286,13 @@ class Problem:
         Raises SeaoptError: there is no such experiment, or the log cannot be read as it would read it.
         """
         renamed = {"name": name_after(log.stem), "log": str(log.resolve())} | ({} if keep_slice else {"slice_s": None})
-        return self._make_experiment(self.choose_template(like).model_copy(update=renamed), anywhere=True)
+        template = self.choose_template(like)
+        if template.held is not None and not keep_slice:
+            raise ProblemError(
+                f"{self.source}: held of {template.name} is of its log alone, and {log.name} begins anywhere in the "
+                'firmware\'s period; give it an [[experiment]] of its own, with its held, and use = "validate"'
+            )
+        return self._make_experiment(template.model_copy(update=renamed), anywhere=True)
 
     def choose_template(self, like: str | None = None) -> ExperimentTable:
         """Return the experiment of a name that has a log; the first, if no name is given.
@@ -318,6 +324,8 @@ class Problem:
         if table.slice_s is not None:
             log = log.between(*table.slice_s)
         log = _resample(log, table).decimate(table.decimate)
+        if table.held is not None:
+            log = log.hold(next(iter(plant.inputs)), table.held.samples, table.held.first)
         columns = {name: column for name, column in table.outputs.items() if isinstance(column, ColumnTable)}
         sigma = table.sigma | {name: column.sigma for name, column in columns.items() if column.sigma is not None}
         return make_record(

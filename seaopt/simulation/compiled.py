@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any
@@ -118,11 +119,20 @@ def _write_sampling(model: Model) -> str:
     if sampling is None or model.linear:
         return ""
     rows, weights = sampling.matrix(tuple(model.plant.states))
-    table = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in weights.tolist())
-    return (
-        f"#define SAMPLED {len(rows)}\nstatic const int sampled_state[SAMPLED] = {{{', '.join(map(str, rows))}}};\n"
-        f"static const double sampled_from[SAMPLED][NX] = {{{table}}};\n"
-    )
+    kept, read, keeps = model.read_states
+    lines = list[str]()
+    if rows:
+        table = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in weights.tolist())
+        lines += [f"#define SAMPLED {len(rows)}", f"static const int sampled_state[SAMPLED] = {{{_join(rows)}}};"]
+        lines += [f"static const double sampled_from[SAMPLED][NX] = {{{table}}};"]
+    if kept:
+        lines += [f"#define KEPT {len(kept)}", f"#define KEPT_BY {keeps}"]
+        lines += [f"static const int kept_state[KEPT] = {{{_join(kept)}}}, kept_of[KEPT] = {{{_join(read)}}};"]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _join(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))
 
 
 def _drop_derivatives(function: ca.Function, name: str) -> ca.Function:

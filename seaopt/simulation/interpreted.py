@@ -66,7 +66,7 @@ def _loss_and_weight(r: VectorN, loss: str, knee: float) -> tuple[VectorN, Vecto
 
 def _inputs_in_force(model: Model, segment: Segment, point: Point) -> Float[np.ndarray, "n w"]:
     """Return [u_a, u_b, ..., 1] of every sample; of a nonlinear plant that follows readings, also the inputs of the
-    four samples around.
+    four samples around, and of one that reads its own states those of the next.
     """
     n, u = segment.n, np.column_stack(segment.u)
     rows = segment.lead + np.arange(n)
@@ -75,7 +75,8 @@ def _inputs_in_force(model: Model, segment: Segment, point: Point) -> Float[np.n
 
 
 def _list_lags(model: Model, point: Point) -> tuple[int, ...]:
-    return point.clock.lags + ((1, 0, -1, -2) if model.reads and not model.linear else ())
+    around = (1, 0, -1, -2) if model.reads and not model.linear else ()
+    return (*point.clock.lags, *around, *((-1,) if model.read_states[0] else ()))
 
 
 def _linear_trajectory(
@@ -121,7 +122,7 @@ def _split(model: Model, scheme: _Scheme, w: Any) -> tuple[Any, list[Any], list[
     """Return t, the inputs in force, and those of the samples around, of a sample's data."""
     nu = model.nu
     rows = [w[2 + i * nu : 2 + (i + 1) * nu] for i in range(scheme.rows)]
-    return w[0], rows[: scheme.inputs], rows[scheme.inputs :]
+    return w[0], rows[: scheme.inputs], rows[scheme.inputs : scheme.inputs + (4 if model.reads else 0)]
 
 
 def _blocks(model: Model, scheme: _Scheme, data: Any) -> list[Any]:
@@ -198,7 +199,12 @@ def _take_steps(model: Model, scheme: _Scheme, layout: Layout, z: Any, w: Any, d
     after, sampling = ca.horzcat(x, s), model.plant.sampling
     if sampling is not None:
         rows, weights = sampling.matrix(tuple(model.plant.states))
-        after[rows, :] = ca.mtimes(ca.DM(weights), z)
+        if rows:
+            after[rows, :] = ca.mtimes(ca.DM(weights), z)
+        kept, read, keeps = model.read_states
+        if kept:
+            following = w[2 + (scheme.rows - 1) * nu + keeps]
+            after[kept, :] = ca.if_else(following > 0.0, after[kept, :], after[read, :])
     return after
 
 

@@ -96,6 +96,16 @@ class Model:
         return len(self.plant.read_inputs)
 
     @property
+    def read_states(self) -> tuple[list[int], list[int], int]:
+        """The states that have what a device read of others, these, and the input that keeps them."""
+        sampling = self.plant.sampling
+        if sampling is None or not sampling.reads:
+            return [], [], 0
+        states, inputs = list(self.plant.states), list(self.plant.inputs)
+        kept, read = ([states.index(name) for name in names] for names in (sampling.reads, sampling.reads.values()))
+        return kept, read, inputs.index(sampling.kept_by)
+
+    @property
     def ny(self) -> int:
         """Number of outputs."""
         return len(self.outputs)
@@ -196,7 +206,7 @@ def _structure(plant: Plant, names: tuple[str, ...], outputs: tuple[str, ...], z
         constants=np.zeros(len(fixed)),
         f=f,
         h=h,
-        linear=not sticks and _is_linear(f, h, plant.t, plant.x, u),
+        linear=not (sticks or (plant.sampling and plant.sampling.reads)) and _is_linear(f, h, plant.t, plant.x, u),
         sticks=sticks,
     )
 

@@ -381,6 +381,14 @@ INLINE void observe(hot *q, const seaopt_pass_args *a, long k, double (*restrict
     output(q, t, u, du, m + SETTINGS, out, wide);
 }
 
+#ifdef KEPT
+/* A device reads states anew at row k, unless it keeps what it has. */
+INLINE void read_states(hot *q, const seaopt_pass_args *a, long k) {
+    if (a->u[KEPT_BY][k < a->length ? k : a->length - 1] > 0.0) return;
+    for (int s = 0; s < KEPT; s++) memcpy(q->z[kept_state[s]], q->z[kept_of[s]], sizeof q->z[0]);
+}
+#endif
+
 /* With a fractional delay the older input acts first, for m[1] seconds: u_b held, or the line from u_c to u_a; then u_a
    held, or the line from u_a to u_b. */
 INLINE void advance(hot *q, const seaopt_pass_args *a, long k, long times, int wide) {
@@ -424,6 +432,9 @@ INLINE void advance(hot *q, const seaopt_pass_args *a, long k, long times, int w
     }
 #ifdef SAMPLED
     set_samples(q, (const double (*)[NJP])before, wide);
+#endif
+#ifdef KEPT
+    read_states(q, a, k + 1);
 #endif
 }
 #endif

@@ -7,8 +7,10 @@ import math
 import tomllib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from seaopt.errors import ProblemError
 from seaopt.estimation.problem.fit_problem import count_evaluations
 from seaopt.estimation.result.trials import HypothesisTrial
 from seaopt.problem import fit_problem, read_problem
@@ -71,6 +73,20 @@ def test_a_start_with_which_free_a_cause_was_found_is_freed_with_it(problem):
     found, lines = adopt(read_problem(problem), trial, ["log"])
     assert found.table.experiment[0].initial_state == "estimate"
     assert tomllib.loads(lines)["experiment"] == [{"name": "log", "initial_state": "estimate"}]
+
+
+def test_a_command_that_is_held_changes_its_log_alone(problem):
+    trial = HypothesisTrial(
+        effect="the command is taken only every few rows of the log", parts=(), outcome="adopted", excess_before=9.0,
+        excess=1.0, frees={}, fixed={}, parameters={}, evaluations=9, holds={"log": (5, 3)},
+    )  # fmt: skip
+    before = read_problem(problem)
+    found, lines = adopt(before, trial)
+    assert tomllib.loads(lines) == {"experiment": [{"name": "log", "held": {"samples": 5, "first": 3}}]}
+    (was,), (held,) = before.experiments(), found.experiments()
+    assert np.array_equal(held.log["I"][3:], np.repeat(was.log["I"][3::5], 5)[: len(was.log) - 3])
+    with pytest.raises(ProblemError, match="held of log is of its log alone"):
+        found.experiment_like(problem.parent / "log.csv")
 
 
 def test_a_fit_may_leave_the_search_for_causes_out(problem, seaopt):

@@ -12,6 +12,12 @@ from scipy.integrate import solve_ivp
 
 import seaopt as so
 from seaopt.errors import PlantError
+from seaopt.simulation.compiled import Program
+from seaopt.simulation.discretisation import Clock
+from seaopt.simulation.interpreted import interpret_pass
+from seaopt.simulation.model import make_model
+from seaopt.simulation.native import find_compiler
+from seaopt.simulation.passes import Point, Segment, Weights
 
 MOTOR = {
     "J_m": 2e-5, "b_r": 1e-5, "K_tau": 0.05, "N": 60.0, "k_s": 200.0, "c_s": 0.3, "J_l": 0.08, "d_l": 0.1, "eta": 0.8,
@@ -127,6 +133,31 @@ def test_a_screw_takes_from_the_supply_what_it_heats_and_makes():
     p = {name: parameter.value for name, parameter in plant.complete(params).items()}
     force = p["K_tau"] / (p["l"] / (2 * np.pi * p["N_p"])) * run["I"]
     assert np.allclose(2.0 * run["I"], 0.5 * run["I"] ** 2 + force * run["qd"], rtol=1e-9, atol=1e-9)
+
+
+def test_a_servo_that_runs_every_few_rows_is_that_of_its_equations():
+    """With a limit and an integral; it reads every seventh row, from the fourth on."""
+    plant = so.plants.rotary(parts=["duty_input", "position_servo", "servo_integral", "servo_limit", "servo_sample"])
+    gains = {"k_p": 40.0, "k_d": 0.3, "k_i": 60.0, "g_s": 0.01, "c_max": 0.5}
+    n, every, first = 300, 7, 3
+    goal = 3.0 * np.sin(np.arange(n) / 15.0)
+    read = [0.0, 0.0, goal[0]]  # position, speed and goal as the firmware has them
+
+    def rates(t, x, k):
+        if t == 0.0 and (k - first) % every == 0 and k > 0:
+            read[:] = [x[0], x[1], goal[k]]
+        error = read[2] - read[0]
+        wanted = gains["g_s"] * (gains["k_p"] * error - gains["k_d"] * read[1] + gains["k_i"] * x[4])
+        command = min(max(wanted, -0.5), 0.5)
+        current = (MOTOR["V_s"] * command - MOTOR["K_tau"] * x[1]) / MOTOR["R"]
+        return [*motion(t, x, current, MOTOR), 0.0 if command != wanted and wanted * error > 0 else error]
+
+    expected = integrate(rates, 5, n)
+    log = so.Log.from_arrays(time=np.arange(n) / RATE_HZ, goal=goal).hold("goal", every, first)
+    run = so.simulate(plant, values_of(plant, **gains), log, rtol=1e-5)
+    assert np.max(np.abs(run["theta_m"] - expected[:, 0])) < 2e-4 * np.max(np.abs(expected[:, 0]))
+    with pytest.raises(PlantError, match='goes without "servo_hold"'):
+        so.plants.rotary(parts=["position_servo", "servo_hold", "servo_sample"])
 
 
 def test_a_servo_with_everything_is_that_of_its_equations():
@@ -282,3 +313,28 @@ def test_plants_without_the_roles_are_refused():
     for part, role in (("voltage_input", "speed="), ("position_servo", "motor_position")):
         with pytest.raises(PlantError, match=role):
             so.plants.wrapped(free, [part])
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize(("delay_s", "free"), [(0.0, False), (0.0033, True)])
+def test_what_firmware_reads_is_the_same_without_a_compiler(delay_s, free):
+    """With derivatives, and from an initial state in which it has read something else than is there."""
+    plant, n = so.plants.rotary(parts=["position_servo", "servo_sample"]), 60
+    params = values_of(plant, k_p=2.0, k_d=0.01, f_c=0.01)
+    log = so.Log.from_arrays(time=np.arange(n) / RATE_HZ, goal=np.sin(np.arange(n) / 9.0)).hold("goal", 5, 2)
+    model = make_model(plant, params, ("J_m", "k_s", "f_c"), ("tau_s", "theta_m"))
+    noise = np.random.default_rng(3).normal(size=(2, n))
+    segment = Segment(u=(log["goal"], log["holds"]), y=tuple(noise))
+    point = Point(
+        theta=np.array(params.values_of(model.free)), offset=np.zeros(2), gain=np.ones(2), substeps=3,
+        clock=Clock(period=1.0 / RATE_HZ, delay_s=delay_s, delay_free=free),
+    )  # fmt: skip
+    weights, x0 = Weights(sections=np.zeros((0, 5)), settle=0, knee=np.full(2, 9e9), loss="square"), np.zeros(model.nx)
+    x0[list(plant.states).index("theta_m_read")] = 0.1
+    fast = Program.make(model, segment, point, weights).run(0, n, x0, outputs=True, columns=True, states=True)
+    slow = interpret_pass(model, segment, point, weights, n, x0)
+    read, there = (slow.states[:, list(plant.states).index(name)] for name in ("theta_m_read", "theta_m"))
+    assert np.array_equal(read[2:], np.repeat(there[2::5], 5)[: n - 2]) and np.all(read[:2] == 0.1)
+    for name in ("outputs", "columns", "states"):
+        a, b = getattr(fast, name), getattr(slow, name)
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10 * np.max(np.abs(b)), err_msg=name)

@@ -34,6 +34,7 @@ from seaopt.plants.friction import list_smoothing
 from seaopt.plants.parts import wrapped
 from seaopt.plants.plant import name_symbols
 from seaopt.records import record
+from seaopt.signals import HOLDS
 from seaopt.units import ROTARY, mechanics_of, unit_after
 
 MOST_REFITTED, MOST_BENDING = 6, 4  # fixed parameters, and those that would make a linear plant nonlinear
@@ -319,7 +320,8 @@ def _take_output(experiment: Experiment, output: str) -> Experiment:
 
 def lead_inputs(experiment: Experiment, samples: int) -> Experiment:
     """Return the experiment with its inputs so many samples early, without the outputs whose inputs are not known."""
-    cut, names = _cut_ends(experiment, samples), [n for n in experiment.plant.inputs if n in experiment.log.signals]
+    inputs = (name for name in experiment.plant.inputs if name != HOLDS)  # which says when positions are read
+    cut, names = _cut_ends(experiment, samples), [name for name in inputs if name in experiment.log.signals]
     led = {name: np.append(cut.log[name][samples:], np.repeat(cut.log[name][-1:], samples)) for name in names}
     return _with_channels(cut, led)
 

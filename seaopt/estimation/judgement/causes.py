@@ -38,6 +38,7 @@ from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment,
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.covariance import measure_colour
 from seaopt.estimation.result.fit_result import Fit, Minimum
+from seaopt.estimation.result.trials import spell_hold
 from seaopt.estimation.solver.budget import EvaluationBudget
 from seaopt.estimation.solver.settle import (
     ROUGH_ITERATIONS,
@@ -318,13 +319,16 @@ def _weigh_hypotheses(
     """Yield what hypotheses about what the model lacks are worth, each with the part that brings it."""
     for refit in hypotheses:
         added = join_words([f"{name} = {value:.4g}" for name, value in {**refit.frees, **refit.fixed}.items()])
-        parts = join_words(refit.change.parts)
+        parts, holds = join_words(refit.change.parts), refit.change.holds
         word = "part" if len(refit.change.parts) == 1 else "parts"
+        written = join_words([f"{spell_hold(hold)} in [[experiment]] {name}" for name, hold in holds.items()])
+        advice = [f"add {word} {parts}" + (f", with {added}" if added else "")] if parts else []
+        advice += [f"write {written}"] if written else []
         candidate = Candidate(
-            where=", ".join(refit.frees),
+            where=", ".join([*refit.frees, *holds]),
             experiments=refit.change.experiments,
             params=refit.change.params,
-            says=f"{refit.change.effect}; add {word} {parts}, with {added}",
+            says=f"{refit.change.effect}; {join_words(advice)}",
             frees=dict.fromkeys(refit.frees, 0.0),
         )
         cause = _weigh(fit, candidate, refit.problem, refit.evaluation, before, colour, poor=False)

@@ -53,7 +53,7 @@ from seaopt.estimation.solver.settle import measure_misfit, settle_roughly
 from seaopt.estimation.solver.step_shares import copy_steps
 from seaopt.formatting import format_percent
 from seaopt.records import record
-from seaopt.signals import weigh_points
+from seaopt.signals import HOLDS, weigh_points
 
 RATES = (2, 3, 4, 5, 10)  # values a row that are tried, as long as each is better than the one before
 POINTS = np.arange(-5.0, 7.0)  # rows of a polynomial, about the two that a value lies between
@@ -88,8 +88,8 @@ def find_unlogged_command(
     experiments = [e.data for e in minimum.problem.experiments]
     plain = all(e.hold == "zero" and not e.feedback and len(e.log_segments) == e.shots == 1 for e in experiments)
     first = max(excess.values(), default=0.0)
-    if not plain or minimum.problem.predicts or any(e.plant.followed for e in experiments):
-        return None
+    if not plain or minimum.problem.predicts or any(e.plant.followed or HOLDS in e.log.signals for e in experiments):
+        return None  # a command that is known to be held over rows is none that changes between them
     commands = [e.log[name] for e in experiments for name in _list_commands(e)]
     if not commands or not all(np.all(np.isfinite(command)) for command in commands):
         return None

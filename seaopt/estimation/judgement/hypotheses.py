@@ -16,12 +16,14 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
+from seaopt.estimation.judgement.hold_search import find_holds
 from seaopt.estimation.judgement.ripple_search import find_followed_ripple, find_ripple, move_zero
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment
 from seaopt.estimation.problem.shapes import Vector
 from seaopt.estimation.result.fit_result import Fit
+from seaopt.estimation.result.trials import Hold
 from seaopt.formatting import join_words
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, add_part
@@ -49,9 +51,10 @@ class Sizes:
     deflection: float  # of the spring
     stiffness: float
     ripple: Mapping[str, float] = field(default_factory=dict[str, float])  # of the residual, over the motor's position
+    holds: Mapping[str, Hold] = field(default_factory=dict[str, Hold])  # of the command, by experiment
 
 
-SIZES = tuple(each.name for each in fields(Sizes) if each.name != "ripple")
+SIZES = tuple(each.name for each in fields(Sizes) if each.name not in ("ripple", "holds"))
 
 
 @record(eq=False)
@@ -62,7 +65,8 @@ class Hypothesis:
     alone, and fixed at its value where the effect is taken: logs hardly tell how large it is. `poles` are in Hz, a
     `dead_time` in s: alone it is an experiment's own delay, and named as that (`candidates`).
     `usual` is of what logs often do not show at all: a size that actuators have, with a spring of that stiffness
-    (`silence`); `built_in` the parameter by which a plant has it without the part.
+    (`silence`); `built_in` the parameter by which a plant has it without the part. One that `holds` the commands of the
+    logs frees nothing, and may need no part.
     """
 
     effect: str
@@ -73,6 +77,7 @@ class Hypothesis:
     poles: tuple[str, ...] = ()
     dead_time: str | None = None
     usual: Callable[[float], float] | None = None
+    holds: bool = False
     built_in: Callable[[Plant], str | None] = lambda plant: None
     lag: Callable[[Mapping[str, float]], float] = lambda start: 0.0  # s, that a fitted delay has in place of the effect
     # that a fitted stiffness has in place of it
@@ -165,6 +170,18 @@ HYPOTHESES = (
     Hypothesis(effect="the motor cogs", part="cogging", starts=lambda s: [s.ripple] if s.ripple else []),
     Hypothesis(effect="the supply sags", part="supply_sag", starts=_zero("R_b")),
     Hypothesis(
+        effect="the command is taken only every few rows of the log",
+        part="",
+        starts=lambda s: [{}] if s.holds else [],
+        holds=True,
+    ),
+    Hypothesis(
+        effect="the servo's firmware runs only every few rows of the log",
+        part="servo_sample",
+        starts=lambda s: [{}] if s.holds else [],
+        holds=True,
+    ),
+    Hypothesis(
         effect="the servo's firmware holds what it reads",
         part="servo_hold",
         starts=lambda s: [{"T_h": 1e-3}],
@@ -210,7 +227,18 @@ class Change:
     @property
     def parts(self) -> tuple[str, ...]:
         """The parts that are added."""
-        return tuple(dict.fromkeys(hypothesis.part for hypothesis in self.hypotheses))
+        return tuple(dict.fromkeys(hypothesis.part for hypothesis in self.hypotheses if hypothesis.part))
+
+    @property
+    def holds(self) -> Mapping[str, Hold]:
+        """Over how many rows the command of each experiment's log is held, and the row from which on; where it is."""
+        return self.sizes.holds if any(hypothesis.holds for hypothesis in self.hypotheses) else {}
+
+    def lag(self, start: Mapping[str, float]) -> float:
+        """Return what a fitted delay has in place of the last of the hypotheses, s."""
+        if not self.hypotheses[-1].holds:
+            return self.hypotheses[-1].lag(start)
+        return 0.5 * max((self.holds[e.name][0] - 1) * e.log.period for e in self.experiments)
 
 
 @record(eq=False)
@@ -288,10 +316,14 @@ def change_plants(
     starts, fixed = hypothesis.starts(sizes), hypothesis.fixed(sizes)
     if not starts or (hypothesis.dead_time is not None and any(map(_has_delay, experiments))):
         return None
+    if hypothesis.holds:
+        if before is not None and before.holds:
+            return None
+        experiments = tuple(_hold(experiment, *sizes.holds[experiment.name]) for experiment in experiments)
     names = {*starts[0], *fixed}
     changed: dict[Plant, Plant] = {}
     for plant in dict.fromkeys(experiment.plant for experiment in experiments):
-        if names <= plant.parameters.keys():
+        if names <= plant.parameters.keys() and (names or not hypothesis.part):
             if any(name in params and (params[name].free or params[name].value != 0.0) for name in names):
                 return None
             changed[plant] = plant
@@ -322,6 +354,12 @@ def change_plants(
     )
 
 
+def _hold(experiment: Experiment, samples: int, first: int) -> Experiment:
+    """Return an experiment whose command stands for so many rows."""
+    assert experiment.plant.actuation is not None  # it has a command that `find_holds` has looked at
+    return replace(experiment, log=experiment.log.hold(experiment.plant.actuation.input, samples, first))
+
+
 def _has_delay(experiment: Experiment) -> bool:
     """Tell whether an experiment's delay is estimated, or its plant has one: a servo's is of its firmware."""
     recipe, delay = experiment.plant.recipe, experiment.delay_s
@@ -334,7 +372,13 @@ def measure_sizes(fit: Fit) -> Sizes:
     residuals = fit.require_minimum("measure_sizes").residuals()
     rows = [_measure(experiment, fit, residuals) for experiment in fit.experiments]
     largest = {name: max(getattr(row, name) for row in rows) for name in SIZES}
-    return Sizes(**largest, ripple=next((row.ripple for row in rows if row.ripple), {}))
+    posed = fit.require_minimum("measure_sizes").problem.experiments
+    shares = {e.name: find_holds(e, residuals[e.name], fit.parameters) for e in posed}
+    # Firmware has one rate, and begins anywhere in a log.
+    common = set[int].intersection(*(set(each) for each in shares.values()))
+    samples = max(common, key=lambda rows: sum(each[rows][0] for each in shares.values()), default=0)
+    holds = {name: (samples, each[samples][1]) for name, each in shares.items() if samples}
+    return Sizes(**largest, ripple=next((row.ripple for row in rows if row.ripple), {}), holds=holds)
 
 
 def _measure(experiment: Experiment, fit: Fit, residuals: ResidualsByExperiment) -> Sizes:

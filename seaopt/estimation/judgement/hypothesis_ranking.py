@@ -14,7 +14,7 @@ import numpy as np
 
 from seaopt.estimation.judgement.hypotheses import Change
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
-from seaopt.estimation.result.trials import HypothesisTrial, Outcome, spell_parameters, spell_parts
+from seaopt.estimation.result.trials import HypothesisTrial, Outcome, spell_holds, spell_parameters, spell_parts
 from seaopt.estimation.solver.least_squares import find_blocked
 from seaopt.records import record
 
@@ -69,9 +69,10 @@ class Refit:
     @property
     def proposal(self) -> str:
         """The lines of a problem file that add its parts to a plant NAME, with their parameters."""
-        recipe = self.change.experiments[0].plant.recipe
-        parts = spell_parts((*(recipe.parts if recipe else ()), *self.change.parts))
-        return "\n".join(["[plant.NAME]", *parts, "[parameters]", *spell_parameters(self.frees, self.fixed)])
+        recipe, values = self.change.experiments[0].plant.recipe, spell_parameters(self.frees, self.fixed)
+        parts = spell_parts((*(recipe.parts if recipe else ()), *self.change.parts)) if self.change.parts else []
+        lines = [*(["[plant.NAME]", *parts] if parts else []), *(["[parameters]", *values] if values else [])]
+        return "\n".join([*lines, *spell_holds(self.change.holds)])
 
     @property
     def python(self) -> str:
@@ -79,7 +80,13 @@ class Refit:
         given = ", ".join(f"{name}={value:g}" for name, value in {**self.frees, **self.fixed}.items())
         free = ", ".join(f'"{name}"' for name in self.frees)
         lines = [f'plant = so.plants.add_part(plant, "{part}")' for part in self.change.parts]
-        lines += [f"params = plant.defaults.with_parameters(*params.values()).update({given}).free({free})"]
+        if given:
+            lines += [f"params = plant.defaults.with_parameters(*params.values()).update({given}).free({free})"]
+        of = {e.name: f"  # of {e.name}" if len(self.change.experiments) > 1 else "" for e in self.change.experiments}
+        for e in self.change.experiments if self.change.holds else ():
+            assert e.plant.actuation is not None
+            samples, first = self.change.holds[e.name]
+            lines += [f'log = log.hold("{e.plant.actuation.input}", samples={samples}, first={first}){of[e.name]}']
         return "\n".join(lines)
 
 
@@ -166,4 +173,5 @@ def _state(refit: Refit, outcome: Outcome, first: float) -> HypothesisTrial:
         evaluations=refit.evaluations,
         proposal=refit.proposal,
         python=refit.python,
+        holds=change.holds,
     )

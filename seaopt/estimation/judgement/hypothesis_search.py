@@ -360,7 +360,7 @@ def _choose_start(
     stiffnesses = [unknowns.names.index(s.stiffness) for s in springs if s and s.stiffness in unknowns.names]
     for start in change.starts:
         z = unknowns.start_from({**fitted, **start})
-        z[delays] -= hypothesis.lag(start)
+        z[delays] -= change.lag(start)
         z[stiffnesses] -= hypothesis.stiffens(change.sizes, start)
         z = np.clip(z, unknowns.low, unknowns.high)
         if not budget.allows(problem, z):

@@ -60,7 +60,7 @@ def find_ripple(
     raw = np.nan_to_num(raw - np.nanmean(raw, axis=1, keepdims=True))
     size = np.sqrt(np.sum(raw**2, axis=1))
     moved = np.abs(np.gradient(position))
-    if not np.ptp(position) or not np.all(size > 0.0):
+    if not np.ptp(position) or not np.all(size > 0.0) or experiment.data.plant.sampling is not None:
         return {}
     residual = np.fft.rfft(raw / size[:, None])
     gain = _respond(experiment.data.plant, params, experiment.data.outputs, experiment.period, position.size)

@@ -251,6 +251,9 @@ class Experiment:
             if isinstance(initial, Mapping) and position in initial:  # known to be there, and taken to rest there
                 history = {f"{name}_held_{i}": initial[position] for i in range(1, difference.samples + 1)}
                 initial = {**history, **initial}
+        if isinstance(initial, Mapping) and plant.sampling is not None:  # firmware has read it before
+            reads = plant.sampling.reads.items()
+            initial = {**{kept: initial[state] for kept, state in reads if state in initial}, **initial}
         object.__setattr__(self, "plant", plant)
         object.__setattr__(self, "initial_state", initial)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import field
 from typing import Literal
 
 from seaopt.codec import OrInfinite
 from seaopt.records import record
 
 Outcome = Literal["adopted", "tied", "tried", "undecided"]
+Hold = tuple[int, int]  # over how many rows of a log a command is held, and a row from which on
 
 
 def state_sticking(parts: Iterable[str]) -> list[str]:
@@ -27,6 +29,18 @@ def spell_parameters(frees: Mapping[str, float], fixed: Mapping[str, float]) -> 
     """Return the lines of [parameters] that a part's parameters take."""
     rows = [f"{name} = {{ value = {value:g}, free = true }}" for name, value in frees.items()]
     return [*rows, *(f"{name} = {value:g}" for name, value in fixed.items())]
+
+
+def spell_holds(holds: Mapping[str, Hold]) -> list[str]:
+    """Return the lines of a problem file that hold the commands of its experiments."""
+    rows = ((f'name = "{name}"', spell_hold(hold)) for name, hold in holds.items())
+    return [line for each in rows for line in ("[[experiment]]", *each)]
+
+
+def spell_hold(hold: Hold) -> str:
+    """Return the line of an experiment that holds its command."""
+    samples, first = hold
+    return f"held = {{ samples = {samples}, first = {first} }}"
 
 
 @record
@@ -49,3 +63,4 @@ class HypothesisTrial:
     evaluations: int  # that it took
     proposal: str = ""  # lines of a problem file that add it; NAME stands for the plant's
     python: str = ""  # the same as a call
+    holds: Mapping[str, Hold] = field(default_factory=dict[str, Hold])  # of the experiments' commands

@@ -25,7 +25,7 @@ from seaopt.logs.quality.clock import (
 )
 from seaopt.logs.quality.report import Quality, assess_quality
 from seaopt.records import PlotAccessor, record
-from seaopt.signals import Signal, VectorN
+from seaopt.signals import HOLDS, Signal, VectorN
 from seaopt.units import factor, si_unit
 
 if TYPE_CHECKING:
@@ -309,6 +309,45 @@ class Log:
         if factor == 1:
             return self
         return self.with_values(*decimation.decimate(self, self.period, self.segments, factor))
+
+    def hold(self, name: str, samples: int, first: int = 0) -> Log:
+        """Hold a command as firmware does that takes it only every so many samples of the log.
+
+        Parameters
+        ----------
+        name : str
+            The command's channel.
+        samples : int
+            Over how many samples each value stands.
+        first : int
+            A sample at which the firmware takes one; before that the command is what the log begins with.
+
+        Returns
+        -------
+        Log
+            With one more channel, `holds`, that is 0 at samples at which a value is taken and 1 elsewhere: the part
+            `servo_sample` of a plant reads its position at the former.
+
+        Raises
+        ------
+        LogError
+            No such channel, or a number that is not whole, or less than one sample.
+
+        Examples
+        --------
+        >>> log = Log.from_arrays(time=[0.0, 0.1, 0.2, 0.3, 0.4], goal=[0.0, 1.0, 2.0, 3.0, 4.0]).hold("goal", 2, 1)
+        >>> log["goal"].tolist(), log["holds"].tolist()
+        ([0.0, 1.0, 1.0, 3.0, 3.0], [1.0, 0.0, 1.0, 0.0, 1.0])
+        """
+        for what, number, least in (("samples", samples, 1), ("first", first, 0)):
+            if isinstance(number, bool) or not isinstance(number, int) or number < least:
+                raise LogError(f"{self.source}: hold: {what} = {number!r} is not a whole number; give {least} or more")
+        since = (np.arange(len(self)) - first) % samples
+        taken = np.maximum(np.arange(len(self)) - since, 0)
+        held = Signal(name=HOLDS, values=(since > 0).astype(float), unit="")
+        command = replace(self.signal(name), values=self[name][taken])
+        note = f"{name}: held over {samples} samples each, from sample {first % samples + 1} on"
+        return replace(self, signals={**self.signals, name: command, HOLDS: held}, notes=(*self.notes, note))
 
     def to_arrays(self) -> dict[str, VectorN]:
         """Return copies of time and channels by name, as `from_arrays` takes them."""

@@ -184,7 +184,7 @@ def check_structure(plant: Plant) -> None:
     for index, name in enumerate(plant.outputs):
         if name not in still and not ca.depends_on(plant.output[index], moved_by):
             raise PlantError(f'output "{name}" depends on no state and no input; check h', plant=plant.name)
-    sampled = plant.sampling.sets if plant.sampling is not None else {}
+    sampled = {*plant.sampling.sets, *plant.sampling.reads} if plant.sampling is not None else set[str]()
     for index, name in enumerate(plant.states):
         if name in sampled:
             continue

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -81,8 +82,9 @@ def add_difference(plant: Plant, name: str, difference: DifferencedSpeed, period
     """
     if name in plant.outputs:
         raise PlantError(f'plant {plant.name} has an output "{name}" of its own; name the difference otherwise')
-    if plant.sampling is not None and plant.sampling.period_s != period_s:
-        raise PlantError(f"plant {plant.name} samples every {plant.sampling.period_s:g} s, not {period_s:g} s")
+    sampling = plant.sampling or Sampling()
+    if sampling.period_s not in (None, period_s):
+        raise PlantError(f"plant {plant.name} samples every {sampling.period_s:g} s, not {period_s:g} s")
     position = find_state(plant, difference.of)
     unit = f"{plant.states[position]}/s"
     memories = [f"{name}_held_{i}" for i in range(1, difference.samples + 1)]
@@ -96,14 +98,14 @@ def add_difference(plant: Plant, name: str, difference: DifferencedSpeed, period
         reading = {behind: 1.0 - share, **{state: share * weight for state, weight in rate.items()}}
         sets[behind] = reading
 
-    before, made = (plant.sampling.sets, plant.sampling.differences) if plant.sampling is not None else ({}, {})
+    made = {**sampling.differences, name: difference}
     return extend(
         plant,
         rates=lambda t, x, u, p: dict.fromkeys(states, 0.0),
         readings=lambda t, x, u, p: {name: sum(weight * getattr(x, state) for state, weight in reading.items())},
         states={**plant.states, **states},
         outputs={**plant.outputs, name: unit},
-        sampling=Sampling(period_s=period_s, sets={**before, **sets}, differences={**made, name: difference}),
+        sampling=replace(sampling, period_s=period_s, sets={**sampling.sets, **sets}, differences=made),
     )
 
 

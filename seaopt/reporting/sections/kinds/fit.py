@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from seaopt.estimation import Fit
 from seaopt.estimation.result.findings import DerivedFigure
-from seaopt.estimation.result.trials import spell_parameters, spell_parts
+from seaopt.estimation.result.trials import spell_hold, spell_parameters, spell_parts
 from seaopt.formatting import MISSING, format_count, format_number, format_percent, join_words
 from seaopt.parameters import Parameter
 from seaopt.reporting.sections.data import Commands, Item, KeyFigure, Reason, Section, Step, Table, Verdict, list_notes
@@ -258,12 +258,13 @@ def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[Step]
     from zero is not to be freed, nor how sharp friction is: a search for that takes long and ends nowhere. What comes
     with a part comes with its line, beside the parts that the plant has. `plants`: the parts of each table.
     """
-    causes = (each for each in fit.findings if each.kind == "cause" and (each.preferred or each.sticks))
-    cause = next(causes, None)
+    named = (each for each in fit.findings if each.kind == "cause")
+    cause = next((each for each in named if each.preferred or each.sticks or each.proposal), None)
     if cause is None:
         return
     trials = {name: row for row in reversed(fit.hypotheses) for name in row.frees}
-    added: dict[str, None] = {}
+    held = next((row for row in fit.hypotheses if row.holds and row.proposal == cause.proposal), None)
+    added: dict[str, None] = dict.fromkeys(held.parts if held else ())
     places: dict[str, dict[str, None]] = {}
     for name in cause.preferred if cause.together is None else cause.together:
         value, std = cause.preferred[name]
@@ -286,6 +287,8 @@ def _list_cures(fit: Fit, plants: Mapping[str, Sequence[str]]) -> Iterator[Step]
         rows += spell_parts((*parts, *added)) if added else []
         if rows:
             yield _write_under(f"[plant.{name}]", rows)
+    for name, hold in held.holds.items() if held else ():
+        yield _write_under(f"[[experiment]], that of the name {name}", [spell_hold(hold)])
     for table, lines in places.items():
         if lines:
             yield _write_under(table, lines)
