@@ -89,6 +89,9 @@ def fit_case(actuator: Actuator, seed: int, seconds: float, logs: int, limit_s: 
             params = plant.defaults.with_parameters(*params.values())
             params = params.update(**{**found.parameters, **found.fixed}).free(*found.frees)
             experiments = [replace(experiment, plant=plant) for experiment in experiments]
+            for i, experiment in enumerate(experiments):
+                if hold := found.holds.get(experiment.name):
+                    experiments[i] = replace(experiment, log=experiment.log.hold("I", *hold))
         elif better := find_better(fit):
             advice = f"from another {', '.join(better)}"
             params = params.update(**better).free(*better)

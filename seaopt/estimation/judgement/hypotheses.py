@@ -66,7 +66,8 @@ class Hypothesis:
     `dead_time` in s: alone it is an experiment's own delay, and named as that (`candidates`).
     `usual` is of what logs often do not show at all: a size that actuators have, with a spring of that stiffness
     (`silence`); `built_in` the parameter by which a plant has it without the part. One that `holds` the commands of the
-    logs frees nothing, and may need no part.
+    logs frees nothing, and may need no part. What goes `further` is tried where the hypothesis is the best and takes
+    half of the excess, but leaves some: by itself it would take a part of much else.
     """
 
     effect: str
@@ -78,6 +79,7 @@ class Hypothesis:
     dead_time: str | None = None
     usual: Callable[[float], float] | None = None
     holds: bool = False
+    further: Hypothesis | None = None
     built_in: Callable[[Plant], str | None] = lambda plant: None
     lag: Callable[[Mapping[str, float]], float] = lambda start: 0.0  # s, that a fitted delay has in place of the effect
     # that a fitted stiffness has in place of it
@@ -128,7 +130,16 @@ HYPOTHESES = (
         starts=lambda s: [{"T_c": 1e-3}],  # from more than it is a step beside another effect ends elsewhere
         dead_time="T_c",
     ),
-    Hypothesis(effect="friction changes over the log", part="friction_drift", starts=_zero("w_c", "b_t")),
+    Hypothesis(
+        effect="friction changes over the log",
+        part="friction_drift",
+        starts=_zero("w_c", "b_t"),
+        further=Hypothesis(
+            effect="friction changes over the log and settles",
+            part="friction_drift",
+            starts=_zero("w_c", "b_t", "r_t"),
+        ),
+    ),
     Hypothesis(
         effect="friction grows with the spring's load",
         part="load_friction",

@@ -35,6 +35,7 @@ from seaopt.estimation.judgement.hypothesis_ranking import (
     Refit,
     TriedHypotheses,
     rank_refits,
+    takes_half,
 )
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import (
@@ -115,7 +116,7 @@ class _Search:
         single = list(self.try_each(problem, fitted, self.fit.experiments, self.fit.parameters))
         single.sort(key=lambda refit: (refit.undecided, refit.excess))
         gone_on = [*map(self.go_on, single[:BASES]), *single[BASES:]]
-        refits = sorted(map(self.doubt, gone_on), key=lambda refit: (refit.undecided, refit.excess))
+        refits = self.go_further(sorted(map(self.doubt, gone_on), key=lambda refit: (refit.undecided, refit.excess)))
         bases = [refit for refit in refits[:BASES] if not refit.undecided]
         partners = [refit.change.hypotheses[-1] for refit in bases]
         # The best with each other first: of two effects either alone may take little.
@@ -140,6 +141,16 @@ class _Search:
             if count_left() < 1.0:
                 self.ended, settled = True, replace(settled, undecided=True)
         return _keep_best([*(refit for refit in refits if refit is not best), settled, *alone])
+
+    def go_further(self, refits: list[Refit]) -> list[Refit]:
+        """Return the refits, the best first, with what goes further than the best where that leaves some excess."""
+        best = next((refit for refit in refits if not refit.undecided), None)
+        further = best.change.hypotheses[0].further if best else None
+        if best is None or further is None or best.excess <= ASKS or not takes_half(self.first, best.excess):
+            return refits
+        change = change_plants(further, self.fit.experiments, self.fit.parameters, self.sizes)
+        refit = _refit_alone(change, best, self.helps, self.base, self.budget) if change else None
+        return refits if refit is None or refit.excess >= best.excess else [refit, *refits]
 
     def go_on(self, refit: Refit) -> Refit:
         """Return a refit that is on its way to a minimum after as many rounds again."""
