@@ -170,10 +170,10 @@ def add_servo(plant: Plant, parts: Collection[str]) -> Plant:
             plant=plant.name,
         )
     sampled, read = "servo_sample" in parts, {name: f"{name}_read" for name in (position, rate) if name}
-    if sampled and ("servo_hold" in parts or not read.keys() <= plant.states.keys()):
+    if sampled and not read.keys() <= plant.states.keys():
         raise PlantError(
-            'part "servo_sample" needs a position, and a speed beside it if there is one, that are states, and goes '
-            'without "servo_hold", which is roughly what it does',
+            'part "servo_sample" needs a position, and a speed beside it if there is one, that are states; give '
+            "such ones in the role sensing",
             plant=plant.name,
         )
     source = next(iter(plant.inputs))

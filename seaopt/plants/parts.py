@@ -199,6 +199,8 @@ def check_parts(parts: Sequence[str]) -> None:
     electric = [part for part in drives.INPUTS if part in parts]
     if len(electric) > 1:
         raise PlantError('parts "voltage_input" and "duty_input" are both given; the motor has one input: give one')
+    if {"servo_hold", "servo_sample"} <= set(parts):
+        raise PlantError('parts "servo_hold" and "servo_sample" are both given; the one is roughly the other: give one')
     if electric and "current_loop" in parts:
         raise PlantError(f'parts "{electric[0]}" and "current_loop" are both given; a current loop takes a current')
 

@@ -105,13 +105,8 @@ def expm_with_derivatives(
 
 
 def check_period(model: Model, clock: Clock) -> None:
-    """Refuse a plant that holds samples of another period, and linear steps of one that takes them at some alone."""
+    """Refuse a plant that holds samples of another period."""
     sampling = model.plant.sampling
-    if model.linear and sampling is not None and sampling.reads:
-        raise SimulationError(
-            f"plant {model.plant.name} reads its states at some samples alone, so that no two of its steps are alike; "
-            "fit it by OutputError, not by errors of prediction"
-        )
     if sampling is None or sampling.period_s is None:
         return
     if abs(sampling.period_s / clock.period - 1.0) > SAME_PERIOD:

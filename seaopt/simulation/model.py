@@ -132,9 +132,13 @@ class Model:
         return np.concatenate([theta, self.constants])
 
     def set_samples(self, step: Float[np.ndarray, "... nx w"]) -> None:
-        """Put what a device samples into a linear step x+ = step [x; ...] and its derivatives, which come behind it."""
+        """Put what a device samples into a linear step x+ = step [x; ...] and its derivatives, which come behind it.
+        One that reads at some samples alone is taken to read at each.
+        """
         if self.plant.sampling is None:
             return
+        kept, read, _ = self.read_states
+        step[..., kept, :] = step[..., read, :]
         rows, weights = self.plant.sampling.matrix(tuple(self.plant.states))
         step[..., rows, :] = 0.0
         (step[0] if step.ndim == 3 else step)[rows, : self.nx] = weights

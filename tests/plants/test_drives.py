@@ -156,7 +156,7 @@ def test_a_servo_that_runs_every_few_rows_is_that_of_its_equations():
     log = so.Log.from_arrays(time=np.arange(n) / RATE_HZ, goal=goal).hold("goal", every, first)
     run = so.simulate(plant, values_of(plant, **gains), log, rtol=1e-5)
     assert np.max(np.abs(run["theta_m"] - expected[:, 0])) < 2e-4 * np.max(np.abs(expected[:, 0]))
-    with pytest.raises(PlantError, match='goes without "servo_hold"'):
+    with pytest.raises(PlantError, match='"servo_hold" and "servo_sample" are both given'):
         so.plants.rotary(parts=["position_servo", "servo_hold", "servo_sample"])
 
 

@@ -341,9 +341,9 @@ ON_A_CURVE = ("friction_drift", "friction_direction", "back_driving", "cogging")
 @pytest.mark.parametrize(
     "excluded",
     [
-        ("voltage_input", "duty_input", "supply_input", "supply_sag", "inductance", "lugre"),
-        ("duty_input", "supply_input", "supply_sag", "current_loop", *ON_A_CURVE),
-        ("voltage_input", "current_loop", *ON_A_CURVE),
+        ("voltage_input", "duty_input", "supply_input", "supply_sag", "inductance", "lugre", "servo_sample"),
+        ("duty_input", "supply_input", "supply_sag", "current_loop", "servo_hold", *ON_A_CURVE),
+        ("voltage_input", "current_loop", "servo_hold", *ON_A_CURVE),
     ],
 )
 def test_every_part_composes_on_every_plant(excluded):

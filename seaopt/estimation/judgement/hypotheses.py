@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from seaopt.errors import SeaoptError
-from seaopt.estimation.judgement.hold_search import find_holds
-from seaopt.estimation.judgement.ripple_search import find_followed_ripple, find_ripple, move_zero
+from seaopt.estimation.judgement.traces.hold_search import find_holds
+from seaopt.estimation.judgement.traces.ripple_search import find_followed_ripple, find_ripple, move_zero
 from seaopt.estimation.problem.experiment import Experiment
 from seaopt.estimation.problem.fit_problem import FitProblem
 from seaopt.estimation.problem.residual_statistics import ResidualsByExperiment

@@ -161,6 +161,11 @@ def collect(
     modelled: list[tuple[Model, Slots]] = []
     for experiment in experiments:
         model = _make_model(experiment, params)
+        if noise and model.read_states[0]:
+            raise EstimationError(
+                f"experiment {experiment.name}: {experiment.plant.name} reads its states at some samples alone, so "
+                "that no one gain corrects them all; fit it with OutputError()"
+            )
         modelled.append((model, _make_slots(builder, experiment, model, noise, band_hz)))
     entries = [*map(_limit, shared), *builder.entries[len(shared) :]]
     unknowns = Unknowns(

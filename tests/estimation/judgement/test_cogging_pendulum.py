@@ -16,7 +16,7 @@ import pytest
 
 import seaopt as so
 from seaopt.estimation.judgement.hypotheses import measure_sizes
-from seaopt.estimation.judgement.ripple_search import find_followed_ripple
+from seaopt.estimation.judgement.traces.ripple_search import find_followed_ripple
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.plants.plant import follow_readings

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.errors import LogError
+from seaopt.errors import EstimationError, LogError
 
 RATE_HZ, SECONDS, STEPS = 500.0, 8.0, 10
 TRUTH = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 5.0, "N": 100.0, "K_tau": 0.05, "k_s": 300.0, "c_s": 0.0}
@@ -28,7 +28,7 @@ def make_goal():
     return t, 8.0 * (np.sin(2.0 * np.pi * (0.2 * t + 24.8 / (2.0 * SECONDS) * t**2)) + 0.4 * noise)
 
 
-def record(rows, first, *, whole_loop, harder=0.0):
+def record(rows, first, *, whole_loop, harder=0.0, v_s=TRUTH["v_s"]):
     """Return a log. `whole_loop`: firmware reads its position, too, every so many rows, and holds what it commands."""
     p, h = TRUTH, 1.0 / RATE_HZ / STEPS
     t, goals = make_goal()
@@ -38,7 +38,7 @@ def record(rows, first, *, whole_loop, harder=0.0):
     def accelerate(angle, speed):
         current = command if whole_loop else SERVO["k_p"] * (taken - angle) - SERVO["k_d"] * speed
         turned = angle / p["N"]
-        rub = p["b_r"] * speed + p["f_c"] * math.tanh(speed / p["v_s"])
+        rub = p["b_r"] * speed + p["f_c"] * math.tanh(speed / v_s)
         return (p["K_tau"] * current - rub - (p["k_s"] * turned + harder * turned**3) / p["N"]) / p["J_m"]
 
     for row, goal in enumerate(goals.tolist()):
@@ -62,12 +62,14 @@ def record(rows, first, *, whole_loop, harder=0.0):
     )
 
 
-def fit(log, *parts, start="estimate"):
+def fit(log, *parts, start="estimate", sticks=False, **options):
     plant = so.plants.rotary(link="locked", parts=["position_servo", *parts])
+    plant = so.plants.let_stick(plant) if sticks else plant
     stated = [so.Parameter(name="k_p", value=1.0, unit=plant.parameter_unit("k_p"))]
-    params = plant.defaults.with_parameters(*stated).update(**TRUTH, **SERVO).update(**START)
+    known = {name: value for name, value in (TRUTH | SERVO | START).items() if name in plant.parameters}
+    params = plant.defaults.with_parameters(*stated).update(**known)
     experiment = so.Experiment(plant=plant, log=log, outputs=("tau_s", "theta_m"), initial_state=start)
-    return so.fit([experiment], params.free(*FREE))
+    return so.fit([experiment], params.free(*FREE), **options)
 
 
 def assert_true(values, rel=1e-3):
@@ -84,6 +86,7 @@ def test_a_firmware_s_rate_is_named_with_the_row_from_which_on_and_its_lines_mak
     assert not found.met and (best.parts, best.outcome, best.holds) == (parts, "adopted", {"experiment": (6, 4)})
     assert best.excess < 1.2 < 5.0 < min(trial.excess for trial in others)
     assert_true(best.parameters)
+    assert so.Fit.from_dict(found.to_dict(), ()).hypotheses == found.hypotheses
     (cause,) = (finding for finding in found.findings if finding.kind == "cause")
     assert cause.proposal is not None and cause.proposal.splitlines()[-1] == "held = { samples = 6, first = 4 }"
     mended = fit(log.hold("goal", *best.holds["experiment"]), *parts)
@@ -99,6 +102,20 @@ def test_a_firmware_s_rate_is_found_beside_a_spring_that_hardens():
     assert ({*best.parts}, best.outcome) == ({"hardening", "servo_sample"}, "adopted")
     assert best.holds == {"experiment": (6, 1)}
     assert_true(best.parameters, rel=3e-3)
+
+
+@pytest.mark.slow
+def test_a_joint_that_sticks_under_slow_firmware_has_its_values():
+    """Between two of its ticks it stops and starts where it will; the log's friction is smoothed over 0.3 rad/s."""
+    log = record(6, 3, whole_loop=True, v_s=0.3).hold("goal", 6, 3)
+    found = fit(log, "servo_sample", start="rest", sticks=True, diagnostics=False)
+    assert_true({name: found.parameters[name].value for name in FREE}, rel=5e-3)
+
+
+def test_errors_of_prediction_are_refused_where_firmware_reads_at_some_rows():
+    log = record(6, 3, whole_loop=True).hold("goal", 6, 3)
+    with pytest.raises(EstimationError, match=r"reads its states at some samples alone.*OutputError\(\)"):
+        fit(log, "servo_sample", method=so.PredictionError())
 
 
 def test_firmware_that_is_as_fast_as_the_log_is_not_said_to_be_slower():

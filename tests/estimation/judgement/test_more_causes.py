@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
-from seaopt.estimation.judgement.ripple_search import find_ripple
+from seaopt.estimation.judgement.traces.ripple_search import find_ripple
 from seaopt.estimation.problem.fit_problem import pose_problem
 from seaopt.estimation.problem.losses import Squares
 from seaopt.estimation.problem.residual_statistics import compute_experiment_residuals
@@ -114,7 +114,7 @@ def test_magnets_are_named_with_their_wave_number():
 
 @pytest.mark.slow
 def test_magnets_are_named_where_a_long_rest_is_in_front(monkeypatch):
-    monkeypatch.setattr("seaopt.estimation.judgement.ripple_search.LONGEST", 2000)
+    monkeypatch.setattr("seaopt.estimation.judgement.traces.ripple_search.LONGEST", 2000)
     check(fit(record(cog=(0.006, 0.003, 12.0), rest_s=6.0)), "cogging", a_g=0.006, b_g=0.003, n_g=12.0)
 
 

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.estimation.judgement.ripple_search import NEARBY
+from seaopt.estimation.judgement.traces.ripple_search import NEARBY
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.parameters import ParameterSet
@@ -72,14 +72,13 @@ def find_holds(
 def _respond(experiment: FitExperiment, params: ParameterSet, command: str, n: int) -> Complex[np.ndarray, "ny f"]:
     """Return what the sliding plant makes of a command that is held from row to row, at the frequencies of n rows."""
     plant, period = experiment.data.plant, experiment.period
+    from scipy.linalg import expm  # deferred: scipy is slow to load
+
     a, b, c, d = state_space(remove_friction(plant), params)
     outputs = [list(plant.outputs).index(name) for name in experiment.data.outputs]
-    column = list(plant.inputs).index(command)
-    values, vectors = np.linalg.eig(a)
-    into, out = np.linalg.solve(vectors, b[:, column : column + 1].astype(complex)), c[outputs] @ vectors
-    still = np.abs(values) * period < 1e-9
-    ends = np.exp(values * period)
-    steps = np.where(still, period, (ends - 1.0) / np.where(still, 1.0, values))
-    z = np.exp(2j * np.pi * np.fft.rfftfreq(n))[1:]
-    response = out @ (into * steps[:, None] / (z - ends[:, None])) + d[outputs, column : column + 1]
+    column, nx = list(plant.inputs).index(command), len(a)
+    whole = expm(period * np.block([[a, b[:, [column]]], [np.zeros((1, nx + 1))]]))
+    z = np.exp(2j * np.pi * np.fft.rfftfreq(n))[1:, None, None]
+    states = np.linalg.solve(z * np.eye(nx) - whole[:nx, :nx], whole[:nx, nx:])
+    response = (c[outputs] @ states)[:, :, 0].T + d[outputs, column : column + 1]
     return np.concatenate([np.zeros((len(outputs), 1)), response], axis=1)

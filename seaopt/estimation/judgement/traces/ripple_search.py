@@ -10,7 +10,7 @@ minima lie one beside the other. Which n are worth a regression is looked up fir
 summed up place by place of the motor, and the spectrum of that has all n at once.
 
 Where a link moves, what the simulated friction does at another time than the true one is far more than cogging: there
-the force is what the measured motion lacks (`seaopt.estimation.judgement.missing_force`).
+the force is what the measured motion lacks (`seaopt.estimation.judgement.traces.missing_force`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.estimation.judgement.missing_force import find_missing_force
+from seaopt.estimation.judgement.traces.missing_force import find_missing_force
 from seaopt.estimation.problem.correlation import find_quick_size
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
