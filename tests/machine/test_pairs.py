@@ -158,3 +158,13 @@ def test_two_faults_that_leave_more_than_noise_say_that_intervals_may_not_hold(c
     assert "the true size may be outside" in " ".join(str(result).split())
     alone = accept(controller, bench.log(scale(damping=2.0), REFERENCE, noise=0.5))
     assert alone.differences.explained
+
+
+@pytest.mark.parametrize("gain", [0.9, 0.7])
+def test_a_mode_beside_a_gain_is_named_with_it(controller, bench, gain):
+    """A motor of another inertia and a gain were named, which left 200 times what noise does."""
+    log = bench.log(scale(per_ampere=gain).with_mode(40.0), REFERENCE, noise=0.5)
+    first = accept(controller, log).differences.found[0]
+    mode, factor = find_part(first, "mode")[0], find_part(first, "gain")[0]
+    assert mode.value == pytest.approx(40.0, rel=0.02) and factor.value == pytest.approx(gain, rel=0.01), first
+    assert first.explains > 0.99 and len(first.beside) == 1, first

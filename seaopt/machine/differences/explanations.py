@@ -26,7 +26,7 @@ from seaopt.control.loops.sampled_plant import DELAYS
 from seaopt.machine.differences.comparison import Comparison, Lines
 from seaopt.machine.differences.drive_limit import find_distortion, make_knob, take_limited, try_limit
 from seaopt.machine.differences.leeway import Spread, take_spread
-from seaopt.machine.differences.pairs import Start, find_pairs
+from seaopt.machine.differences.pairs import Start, find_pairs, is_worth
 from seaopt.machine.differences.size_fit import Best, Difference, SizeFit, Tried
 from seaopt.machine.differences.size_search import (
     FOUND,
@@ -122,6 +122,9 @@ def explain(
     if tried[0].left > comparison.most_noise * noise:
         starts = _list_starts(case, kinds, limit, limited)
         pairs = find_pairs(starts, _list_knobs(case), values, spread, tried, noise)
+        inside = tried[0].difference.low is not None  # else more of it than is tried may be all
+        modes = [each for each in _try_mode(case, _find_gain(tried)) if inside and is_worth(each, tried[0].left, noise)]
+        pairs = [*modes, *pairs] if modes and (not pairs or modes[0].rank < pairs[0].left) else pairs
         kinds = [*([pair] for pair in pairs), *kinds]
     return _list_found(case, kinds, told=told)
 
@@ -307,7 +310,7 @@ def _try_shapes(case: Case) -> Iterator[Tried]:
         shaped = Tried(difference=difference, left=best.left, response=best.response)
         moves = kind == "delay" and value > 0.0 and case.comparison.simulates
         yield _simulate_delay(case, shaped) if moves else shaped
-    yield from _try_mode(fit, model)
+    yield from _try_mode(case)
 
 
 def _simulate_delay(case: Case, shaped: Tried) -> Tried:
@@ -320,11 +323,17 @@ def _simulate_delay(case: Case, shaped: Tried) -> Tried:
     return found[0].conclude(case.values) if found else shaped
 
 
-def _try_mode(fit: SizeFit, model: Lines) -> Iterator[Tried]:
+def _find_gain(tried: Sequence[Tried]) -> float:
+    """Return the gain that explains most by itself."""
+    return next((each.difference.value for each in tried if each.difference.kind == "gain"), 1.0)
+
+
+def _try_mode(case: Case, gain: float | None = None) -> Iterator[Tried]:
     """Yield the mode that fits best: a mass on a spring beside the drive, or a pair of zeros and one of poles. The
     force that a mass on a spring takes of the motion is added to the inverse of the response without hold and delay.
+    `gain`: from which on one beside it is sought.
     """
-    comparison = fit.comparison
+    fit, model, comparison = case.fit, case.model, case.comparison
     f, controller = comparison.f, comparison.controller
     late = (controller.delay_samples + 0.5) * controller.sample_time_s
     held = np.sinc(f * controller.sample_time_s) * np.exp(-2j * np.pi * f * late)
@@ -344,16 +353,21 @@ def _try_mode(fit: SizeFit, model: Lines) -> Iterator[Tried]:
     def divide(x: Float[np.ndarray, " k"]) -> Lines:
         return pair(*take(x, 0)) / pair(*take(x, 2))
 
-    misfit = np.abs((comparison.response - model) / comparison.std)
+    gains, near = ([], model) if gain is None else ([gain], gain * model)
+
+    def make(x: Float[np.ndarray, " k"], shape: Callable[[Any], Lines]) -> Lines:
+        return model * shape(x) * (x[-1] if gains else 1.0)
+
+    misfit = np.abs((comparison.response - near) / comparison.std)
     best: tuple[Best, Callable[[Any], Lines]] | None = None
-    apart = np.where(misfit > SEEN, np.abs(comparison.response / model - 1.0), 0.0)
+    apart = np.where(misfit > SEEN, np.abs(comparison.response / near - 1.0), 0.0)
     for line in np.unique(np.concatenate([np.argsort(-misfit)[:2], np.argsort(-apart)[:2]])):
         at, scale = math.log(f[line]), float(1.0 / abs(moved[line]))
         for damping in map(math.log, MODE_DAMPINGS):
             starts = [(partial(absorb, scale=scale), [at, damping, sign * 0.1]) for sign in (1.0, -1.0)]
             starts += [(divide, [at, damping, at + step, damping]) for step in (-0.05, 0.05)]
             for shape, start in starts:
-                found = fit.solve(lambda x, shape=shape: model * shape(x), start)
+                found = fit.solve(partial(make, shape=shape), [*start, *gains])
                 hertz, damped = take(found.sizes, 0)
                 inside = f[0] < hertz < np.max(f) and damped < MOST_DAMPED
                 if inside and (best is None or found.left < best[0].left):
@@ -367,9 +381,16 @@ def _try_mode(fit: SizeFit, model: Lines) -> Iterator[Tried]:
             kind="mode", name="mode", value=value, low=low, high=high, unit="Hz", explains=0.0,
             size=value / float(take(found.sizes, 2)[0]) if shape is divide else None,
             changes=changes, changes_low=least, changes_high=most,
+            beside=tuple(_state_gain(float(found.sizes[-1]), float(found.stds[-1])) for _ in gains),
         )  # fmt: skip
         # it has some sizes where others have one
         yield Tried(difference=difference, left=found.left + 3.0, response=found.response)
+
+
+def _state_gain(value: float, std: float) -> Difference:
+    """Return a gain with its interval."""
+    low, high = value - SURE * std, value + SURE * std
+    return Difference(kind="gain", name="gain", value=value, low=low, high=high, unit="-", explains=0.0)
 
 
 def _find_change(found: Best, shape: Callable[[Any], Lines]) -> tuple[float, float | None, float | None]:

@@ -58,7 +58,7 @@ def find_pairs(
         seen.append({*search.names})
         found += _search_on(start, search, values, spread)
     least, alone = min(each.left for each in singles), {each.difference.name: each.left for each in singles}
-    found = [_order(each, alone) for each in found if _is_worth(each, least, noise)]
+    found = [_order(each, alone) for each in found if is_worth(each, least, noise)]
     found.sort(key=lambda each: each.left)
     return _fold([each for each in found if each.is_untold(found[0], noise)])
 
@@ -97,7 +97,7 @@ def _order(pair: Tried, alone: Mapping[str, float]) -> Tried:
     return replace(pair, difference=replace(first, beside=tuple(others)))
 
 
-def _is_worth(pair: Tried, single: float, noise: float) -> bool:
+def is_worth(pair: Tried, single: float, noise: float) -> bool:
     """Tell whether two causes explain much more than one, and both are there."""
     gained = single - pair.left > 2.0 * UNTOLD * max(pair.left / noise, 1.0)
     parts = (pair.difference, *pair.difference.beside)
