@@ -133,7 +133,7 @@ def test_nothing_moves_until_something_happens(controller, proportional, swing, 
     for phi in np.linspace(-1.2, 1.2, 13):  # speeds are rounding then, which no number of steps makes smaller
         trace = play(Rig(controller=controller, plant=swing), still, [at(thor, phi=phi, delay_s=0.2e-3)])
         assert np.ptp(trace.outputs["phi"][0]) < 1e-9
-        assert trace.substeps == 2
+        assert trace.substeps == 4  # as guessed
     for law in (controller, proportional):
         trace = play(Rig(controller=law, plant=swing), still, [at(thor, phi=0.9, delay_s=0.2e-3), thor])
         assert np.ptp(trace.outputs["phi"][0]) < 1e-9
