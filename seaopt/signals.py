@@ -21,6 +21,7 @@ MatrixMN = Float[np.ndarray, "m n"]
 ComplexM = Complex[np.ndarray, " m"]
 ComplexN = Complex[np.ndarray, " n"]
 RowsK = Int[np.ndarray, " k"]
+RowsN = Int[np.ndarray, " n"]
 
 # What channels are called where nobody says what they are, in any case.
 INPUT_NAMES = frozenset({"i", "fe1", "fe2", "u", "v", "duty", "goal"})
@@ -56,6 +57,15 @@ def bridge(values: VectorN) -> VectorN:
     """Return a signal with its missing samples on lines between those that are there."""
     there = np.flatnonzero(np.isfinite(values))
     return values if there.size in (0, values.size) else np.interp(np.arange(values.size), there, values[there])
+
+
+def find_taken(n: int, samples: int, first: int) -> tuple[RowsN, RowsN]:
+    """Return, for each of n rows of a command that is taken every so many of them, the row at which its value was taken
+    (before `first` the row that the log begins with), and how many rows ago that is of any log.
+    """
+    rows = np.arange(n)
+    since = (rows - first) % samples
+    return np.maximum(rows - since, 0), since
 
 
 def weigh_points(points: VectorN, at: float) -> VectorN:

@@ -32,6 +32,7 @@ from seaopt.frequency import MeasuredResponse, measure_response
 from seaopt.logs import Counter, Log, Readings, read_log
 from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import DifferencedSpeed, Plant
+from seaopt.plants.plant import name_input
 from seaopt.problem.bench_tables import (
     ColumnTable,
     EquationsTable,
@@ -325,7 +326,7 @@ class Problem:
             log = log.between(*table.slice_s)
         log = _resample(log, table).decimate(table.decimate)
         if table.held is not None:
-            log = log.hold(next(iter(plant.inputs)), table.held.samples, table.held.first)
+            log = log.hold(name_input(plant)[0], table.held.samples, table.held.first)
         columns = {name: column for name, column in table.outputs.items() if isinstance(column, ColumnTable)}
         sigma = table.sigma | {name: column.sigma for name, column in columns.items() if column.sigma is not None}
         return make_record(

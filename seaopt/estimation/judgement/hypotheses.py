@@ -29,7 +29,7 @@ from seaopt.parameters import Parameter, ParameterSet
 from seaopt.plants import Plant, add_part
 from seaopt.plants.memo import memo
 from seaopt.plants.parts import list_dead_times
-from seaopt.plants.plant import name_symbols
+from seaopt.plants.plant import name_input, name_symbols
 from seaopt.records import record
 from seaopt.simulation import simulate
 
@@ -367,8 +367,7 @@ def change_plants(
 
 def _hold(experiment: Experiment, samples: int, first: int) -> Experiment:
     """Return an experiment whose command stands for so many rows."""
-    assert experiment.plant.actuation is not None  # it has a command that `find_holds` has looked at
-    return replace(experiment, log=experiment.log.hold(experiment.plant.actuation.input, samples, first))
+    return replace(experiment, log=experiment.log.hold(name_input(experiment.plant)[0], samples, first))
 
 
 def _has_delay(experiment: Experiment) -> bool:

@@ -16,6 +16,7 @@ from seaopt.estimation.judgement.hypotheses import Change
 from seaopt.estimation.problem.fit_problem import Evaluation, FitProblem
 from seaopt.estimation.result.trials import HypothesisTrial, Outcome, spell_holds, spell_parameters, spell_parts
 from seaopt.estimation.solver.least_squares import find_blocked
+from seaopt.plants.plant import name_input
 from seaopt.records import record
 
 ASKS = 1.5  # times its noise a residual is before anything is looked for
@@ -84,9 +85,8 @@ class Refit:
             lines += [f"params = plant.defaults.with_parameters(*params.values()).update({given}).free({free})"]
         of = {e.name: f"  # of {e.name}" if len(self.change.experiments) > 1 else "" for e in self.change.experiments}
         for e in self.change.experiments if self.change.holds else ():
-            assert e.plant.actuation is not None
             samples, first = self.change.holds[e.name]
-            lines += [f'log = log.hold("{e.plant.actuation.input}", samples={samples}, first={first}){of[e.name]}']
+            lines += [f'log = log.hold("{name_input(e.plant)[0]}", samples={samples}, first={first}){of[e.name]}']
         return "\n".join(lines)
 
 

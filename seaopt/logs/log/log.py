@@ -25,7 +25,7 @@ from seaopt.logs.quality.clock import (
 )
 from seaopt.logs.quality.report import Quality, assess_quality
 from seaopt.records import PlotAccessor, record
-from seaopt.signals import HOLDS, Signal, VectorN
+from seaopt.signals import HOLDS, Signal, VectorN, find_taken
 from seaopt.units import factor, si_unit
 
 if TYPE_CHECKING:
@@ -342,8 +342,7 @@ class Log:
         for what, number, least in (("samples", samples, 1), ("first", first, 0)):
             if isinstance(number, bool) or not isinstance(number, int) or number < least:
                 raise LogError(f"{self.source}: hold: {what} = {number!r} is not a whole number; give {least} or more")
-        since = (np.arange(len(self)) - first) % samples
-        taken = np.maximum(np.arange(len(self)) - since, 0)
+        taken, since = find_taken(len(self), samples, first)
         held = Signal(name=HOLDS, values=(since > 0).astype(float), unit="")
         command = replace(self.signal(name), values=self[name][taken])
         note = f"{name}: held over {samples} samples each, from sample {first % samples + 1} on"

@@ -14,21 +14,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Complex, Float
 
-from seaopt.estimation.judgement.traces.ripple_search import NEARBY
+from seaopt.estimation.judgement.traces.whitening import Spectra, is_told, whiten
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
 from seaopt.parameters import ParameterSet
 from seaopt.plants.friction import remove_friction
 from seaopt.plants.plant import state_space
-from seaopt.signals import HOLDS
+from seaopt.signals import HOLDS, find_taken
 
 MOST = 20  # rows that a value may stand for
 LONGEST = 16_384  # rows that are looked at
-LEAST, OF_CHANCE = 0.01, 40.0  # of a whitened residual that a hold has to account for, and times a row's share
-
-Signal = Float[np.ndarray, " n"]
 
 
 def find_holds(
@@ -44,32 +40,25 @@ def find_holds(
     if not plain or command not in log.signals or HOLDS in log.signals or plant.sampling is not None:
         return {}
     rows = slice(0, LONGEST)
-    u, raw = log[command][data.log_segments[0]][rows], left.segments[0].raw[rows].T
-    raw = np.nan_to_num(np.nanmean(raw, axis=1, keepdims=True) - raw)  # measured less model
-    size = np.sqrt(np.sum(raw**2, axis=1, keepdims=True))
-    if u.size < 4 * MOST or not np.all(size > 0.0) or not np.ptp(u):
+    u, whitened = log[command][data.log_segments[0]][rows], whiten(-left.segments[0].raw[rows].T)  # measured less model
+    if u.size < 4 * MOST or whitened is None or not np.ptp(u):
         return {}
-    residual = np.fft.rfft(raw / size)
-    nearby = min(NEARBY, residual.shape[1])
-    own = np.stack([np.convolve(row, np.full(nearby, 1.0 / nearby), "same") for row in np.abs(residual) ** 2])
-    own = np.sqrt(np.maximum(own, 1e-300))
-    residual, gain = residual / own, _respond(experiment, params, command, u.size) / size / own
-    whole = float(np.sum(np.abs(residual) ** 2))
-    least, found = max(LEAST, OF_CHANCE / u.size), dict[int, tuple[float, int]]()
+    residual, scale = whitened
+    gain = _respond(experiment, params, command, u.size) / scale
+    whole, found = float(np.sum(np.abs(residual) ** 2)), dict[int, tuple[float, int]]()
     for samples in range(2, MOST + 1):
-        index = np.arange(u.size)
-        held = np.stack([u[np.maximum(index - (index - first) % samples, 0)] for first in range(samples)])
+        held = np.stack([u[find_taken(u.size, samples, first)[0]] for first in range(samples)])
         columns = np.fft.rfft(held - np.mean(held, axis=0))[:, None] * gain
         along = np.sum(np.real(np.conj(columns) * residual), axis=(1, 2))
         shares = along * np.maximum(along, 0.0) / np.sum(np.abs(columns) ** 2, axis=(1, 2)) / whole
         first = int(np.argmax(shares))
-        if shares[first] > least:
+        if is_told(float(shares[first]), u.size):
             start = data.log_segments[0].start
             found[samples] = float(shares[first]), (start + first) % samples
     return found
 
 
-def _respond(experiment: FitExperiment, params: ParameterSet, command: str, n: int) -> Complex[np.ndarray, "ny f"]:
+def _respond(experiment: FitExperiment, params: ParameterSet, command: str, n: int) -> Spectra:
     """Return what the sliding plant makes of a command that is held from row to row, at the frequencies of n rows."""
     plant, period = experiment.data.plant, experiment.period
     from scipy.linalg import expm  # deferred: scipy is slow to load

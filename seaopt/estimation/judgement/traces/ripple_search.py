@@ -18,9 +18,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from seaopt.estimation.judgement.traces.missing_force import find_missing_force
+from seaopt.estimation.judgement.traces.whitening import Spectra, is_told, whiten
 from seaopt.estimation.problem.correlation import find_quick_size
 from seaopt.estimation.problem.fit_experiment import FitExperiment
 from seaopt.estimation.problem.residual_statistics import ExperimentResiduals
@@ -34,13 +35,10 @@ LONGEST = 10_000  # samples, where the motor travels most: each wave number that
 TRIED = 8  # of each octave
 PLACES = 8  # per period of the largest wave number, that what residuals have of a force is summed up in
 FINE = 8  # steps on either side of the best
-NEARBY = 31  # lines of a spectrum over which its power is its own
-LEAST, OF_CHANCE = 0.01, 40.0  # of a whitened residual that a ripple has to account for, and times a sample's share
 TURNS = 0.25  # of a period, the most that the motor moves in a sample
 SURE = 1.0 / 3.0  # of the wave number that a reading is fine enough for: its steps repeat with the position, too
 SLOW = 0.2  # of the samples that have to be as slow as that
 
-Spectra = Complex[np.ndarray, "ny f"]
 Weight = tuple[float, int, float, float]  # share that a wave number accounts for, of so many samples; both amplitudes
 
 
@@ -56,18 +54,12 @@ def find_ripple(
     `position`: of the motor, over segment `number`.
     """
     looked = _find_travel(position)
-    position, raw = position[looked], left.segments[number].raw.T[:, looked]
-    raw = np.nan_to_num(raw - np.nanmean(raw, axis=1, keepdims=True))
-    size = np.sqrt(np.sum(raw**2, axis=1))
-    moved = np.abs(np.gradient(position))
-    if not np.ptp(position) or not np.all(size > 0.0) or experiment.data.plant.sampling is not None:
+    position = position[looked]
+    whitened = whiten(left.segments[number].raw.T[:, looked])
+    if not np.ptp(position) or whitened is None or experiment.data.plant.sampling is not None:
         return {}
-    residual = np.fft.rfft(raw / size[:, None])
-    gain = _respond(experiment.data.plant, params, experiment.data.outputs, experiment.period, position.size)
-    nearby = min(NEARBY, residual.shape[1])
-    own = np.stack([np.convolve(row, np.full(nearby, 1.0 / nearby), "same") for row in np.abs(residual) ** 2])
-    own = np.sqrt(np.maximum(own, 1e-300))
-    residual, gain = residual / own, gain / size[:, None] / own
+    (residual, scale), moved = whitened, np.abs(np.gradient(position))
+    gain = _respond(experiment.data.plant, params, experiment.data.outputs, experiment.period, position.size) / scale
 
     def weigh(wave: float) -> Weight:
         slow = moved * wave < 2.0 * np.pi * TURNS
@@ -122,7 +114,7 @@ def _search_waves(
         return {}
     best = max(best + step * np.linspace(-1.0, 1.0, 2 * FINE + 1), key=lambda wave: weigh(wave)[0])
     share, count, a, b = weigh(best)
-    return {"a_g": a, "b_g": b, "n_g": float(best)} if share > max(LEAST, OF_CHANCE / count) else {}
+    return {"a_g": a, "b_g": b, "n_g": float(best)} if is_told(share, count) else {}
 
 
 def move_zero(experiment: FitExperiment, z: Vector, ripple: Mapping[str, float], state: str) -> Mapping[str, float]:
