@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 from typing import Any
 
 import casadi as ca
@@ -96,8 +97,11 @@ def sticking_line_step(plant: Plant) -> ca.Function:
     stopped = free + ca.mtimes(ca.horzcat(*(each - free for each in pushed)), forces)
     # One force for a step leaves no velocity at its end, but some within it: what it holds all along does not move.
     held = first * (share < AT_ONCE) * (ca.fabs(forces) < limits)
-    for state, joint in joints.places:
-        stopped[state] = ca.if_else(held[joint], x[state], stopped[state])
+    rate_of = joints.rate(t, x, u0, p, ca.SX.sym("force", levels.numel()))
+    rates, velocities = ca.vertsplit(rate_of), ca.vertsplit(joints.speeds(x, p))
+    for (state, rate), (joint, speed) in product(enumerate(rates), enumerate(velocities)):
+        if _moves_with(rate, speed, x):
+            stopped[state] = ca.if_else(held[joint], x[state], stopped[state])
     return ca.Function("step", [t, x, u0, u1, p, length], [ca.densify(ca.if_else(ca.mmax(stops), stopped, end))])
 
 
@@ -163,12 +167,6 @@ class _Joints:
         self.rate = ca.Function("rate", arguments, [f])
         self.read = ca.Function("read", arguments, [h])
         self.accelerate = ca.Function("accelerate", arguments, [ca.jtimes(speeds, plant.x, f)])
-        self.places = [
-            (state, joint)
-            for state, rate in enumerate(ca.vertsplit(f))
-            for joint, speed in enumerate(velocities)
-            if _moves_with(rate, speed, plant.x)
-        ]
 
     def slide(self, x: Any, u: Any, p: Any, signs: Any) -> Any:
         """Return the forces of joints that slide in the directions `signs`."""
