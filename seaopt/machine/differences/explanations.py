@@ -123,7 +123,8 @@ def explain(
         starts = _list_starts(case, kinds, limit, limited)
         pairs = find_pairs(starts, _list_knobs(case), values, spread, tried, noise)
         inside = tried[0].difference.low is not None  # else more of it than is tried may be all
-        modes = [each for each in _try_mode(case, _find_gain(tried)) if inside and is_worth(each, tried[0].left, noise)]
+        sought = _try_mode(case, _find_gain(tried)) if inside else ()
+        modes = [each for each in sought if is_worth(each, tried[0].left, noise)]
         pairs = [*modes, *pairs] if modes and (not pairs or modes[0].rank < pairs[0].left) else pairs
         kinds = [*([pair] for pair in pairs), *kinds]
     return _list_found(case, kinds, told=told)
