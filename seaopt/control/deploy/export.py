@@ -202,11 +202,7 @@ def export(
         "raised_from": strip_markup(find_raised_limit(stored.command, stored.spec, limit)),
     }
     beside, described = _describe_beside(context, stored, law, log_rows, tare, stop)
-    texts = {
-        pattern.format(prefix): render(template, context | described | numbers.get(pattern[-2:], {}))
-        for pattern, template in {**templates, **beside}.items()
-    }
-    return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+    return _write(Path(folder), {**templates, **beside}, context | described, numbers)
 
 
 def export_beside(
@@ -245,8 +241,21 @@ def export_beside(
     reads = dict.fromkeys((*controller.further, *controller.signals[1:]))  # as `ReadsLink.reads` has them
     plan = [f"read_{identifier(name)}" for name in reads]
     templates, described = _describe_beside(context, controller, law, log_rows, tare, stop, plan)
-    texts = {pattern.format(PLAN): render(template, context | described) for pattern, template in templates.items()}
-    return tuple(write_text(Path(folder) / file, text) for file, text in texts.items())
+    return _write(Path(folder), templates, context | described, {})
+
+
+def _write(
+    folder: Path,
+    templates: Mapping[str, str],
+    context: Mapping[str, Any],
+    numbers: Mapping[str, Mapping[str, Any]],
+) -> tuple[Path, ...]:
+    """Write each template's text, all of them rendered before the first is written. `numbers`: of each suffix."""
+    texts = {
+        pattern.format(context["name"]): render(template, {**context, **numbers.get(pattern[-2:], {})})
+        for pattern, template in templates.items()
+    }
+    return tuple(write_text(folder / file, text) for file, text in texts.items())
 
 
 def _describe_beside(
