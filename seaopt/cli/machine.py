@@ -25,6 +25,7 @@ from seaopt.control.mpc.stored import TUNE_AGAIN, check_described
 from seaopt.errors import ProblemError, SeaoptError
 from seaopt.estimation import Fit
 from seaopt.files import read_json, to_json, write_json, write_text
+from seaopt.formatting import join_words
 from seaopt.logs import Quality, write_log
 from seaopt.logs.quality.report import QUALITY_SCHEMA
 from seaopt.machine import Acceptance, BringUp, Stage, accept, bring_up
@@ -51,10 +52,8 @@ FILE, PAGE, QUALITY = FILES["accept"], "acceptance.html", "quality.json"
 BRING_UP, PLAN = "bringup", "bringup.json"  # the folder of the stages, and what they are
 LATER = 5e-3  # s, by which a drive may be later than twice what it was
 AGAIN = "again"  # the folder of accepted logs, for a fit
-TABLES = """# A loop carries noise back into its command: fit such logs by prediction errors.
-# In the problem file: [fit] with method = "prediction_error", and these tables.
-"""
 TABLE = """
+# A loop carries noise back into its command: fit such logs by prediction errors, method = "prediction_error" in [fit].
 [[experiment]]
 name = "{name}"
 plant = "{plant}"
@@ -116,7 +115,8 @@ def accept_logs(
     content = write(result, session, logs)
     written = write_again(result, session)
     if written:
-        errors.wrap(f"note: to fit these logs too, put the tables of {written[-1]} into the problem file")
+        tables = join_words([str(path) for path in written[1::2]])
+        errors.wrap(f"note: to fit these logs too, put what is in {tables} into the problem file")
     files = [folder / FILE, folder / PAGE, *written]
     again = session.spell("certify" if stage is None else "bringup")
     commands = Commands(fit=session.spell("fit"), tune=session.spell("tune"), certify=again)
@@ -347,23 +347,26 @@ def write(result: Acceptance, session: Session, logs: Sequence[Path]) -> dict[st
 
 
 def write_again(result: Acceptance, session: Session) -> list[Path]:
-    """Write the logs that are of the law as a fit takes them, and the tables of their experiments."""
-    problem, folder, files, text = session.problem, session.folder / AGAIN, list[Path](), TABLES
+    """Write the logs that are of the law as a fit takes them, and beside each the table of its experiment."""
+    problem, folder, files = session.problem, session.folder / AGAIN, list[Path]()
     delay = find_drive_delay(result.controller.spec, problem.design_plant, session.parameters())
-    for number, (plant, log) in enumerate(result.experiments, start=1):
+    for plant, log in result.experiments:
         name = next(name for name, each in problem.plants.items() if each is plant)
         stem = re.sub(r"\W+", "_", Path(log.source).stem) or "log"
-        label = f"{stem}_under_law" if len(result.experiments) == 1 else f"{stem}_under_law_{number}"
-        files.append(write_log(log, folder / f"{label}.csv"))
+        label = f"{stem}_under_{result.stage or 'law'}"
+        if folder / f"{label}.csv" in files:  # another log of this name, of another folder
+            label += f"_{len(files)}"
+        path = write_log(log, folder / f"{label}.csv")
         headers = {head.partition(" ")[0]: head for head in log.to_polars().columns}
         inputs, outputs = (
             ", ".join(f'{each} = "{headers[each]}"' for each in names if each in headers)
             for names in (plant.inputs, plant.outputs)
         )
-        path = os.path.relpath(files[-1], problem.folder).replace(os.sep, "/")
-        text += TABLE.format(name=label, plant=name, log=path, inputs=inputs, outputs=outputs)
-        text += DELAYED.format(delay=delay, most=2.0 * delay + LATER) if delay else ""
-    return [*files, write_text(folder / "experiments.toml", text)] if files else []
+        place = os.path.relpath(path, problem.folder).replace(os.sep, "/")
+        table = TABLE.format(name=label, plant=name, log=place, inputs=inputs, outputs=outputs)
+        table += DELAYED.format(delay=delay, most=2.0 * delay + LATER) if delay else ""
+        files += [path, write_text(folder / f"{label}.toml", table)]
+    return files
 
 
 def plan_bring_up(

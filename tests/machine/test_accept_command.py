@@ -17,6 +17,7 @@ from seaopt.errors import LogError
 from seaopt.files import to_json, write_json
 from seaopt.machine import bring_up
 from seaopt.problem.loop_logs import read_loop_log
+from seaopt.problem.proposal import propose
 from seaopt.robustness.certificate.simulated import SIMULATIONS
 from tests.c_code import CompiledLog
 from tests.checks import leave_out
@@ -85,8 +86,9 @@ def test_a_log_of_this_law_is_accepted(folder, accept):
 
 def test_an_accepted_log_is_an_experiment_of_a_fit(folder, accept):
     done = accept(folder / "good.csv", "--reference", "reference")
-    assert "experiments.toml" in done.output
-    tables = (folder / "out" / "again" / "experiments.toml").read_text()
+    assert "good_under_law.toml" in done.output
+    accept(shutil.copy(folder / "good.sealog", folder / "next.sealog"))  # another log, whose table is another file
+    tables = (folder / "out" / "again" / "good_under_law.toml").read_text()
     free = "parameters = { J = { value = 2.5e-6, free = true }, eta = { value = 0.9, free = true }, I_p"
     text = PROBLEM.replace("parameters = { I_p", free, 1) + '[fit]\nmethod = "prediction_error"\n' + tables
     (folder / "again.toml").write_text(text)
@@ -95,6 +97,12 @@ def test_an_accepted_log_is_an_experiment_of_a_fit(folder, accept):
     log, raw = experiment.log, so.read_log(folder / "good.csv")
     assert experiment.feedback and experiment.delay_s == 0.0  # the program's sample of delay is in the rows
     assert np.array_equal(log["I"], raw["I"][:-1]) and np.array_equal(log["F1"], raw["F1"][1:])
+
+
+def test_a_problem_file_for_a_log_of_the_target_says_that_it_is_under_a_law(folder):
+    (note,) = [note for note in propose([folder / "good.sealog"], {}, folder).notes if "law" in note]
+    assert "good.sealog: was logged under a law" in note and "seaopt accept" in note
+    assert not [note for note in propose([folder / "good.csv"], {}, folder).notes if "law" in note]
 
 
 def test_a_log_of_the_target_is_taken_as_it_is(folder, accept):

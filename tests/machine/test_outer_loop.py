@@ -267,8 +267,8 @@ def test_the_command_writes_it_as_an_experiment_of_the_links_plant(tmp_path):
     law = so.Controller.from_dict(content, problem.design_plant, problem.values(problem.parameters))
     so.write_log(make_log(run(law, excite(20.0, 7))), tmp_path / "running.csv")
     done = call(app, ["accept", options[0], str(tmp_path / "running.csv"), *options[1:]])
-    assert "experiments.toml" in done.output, done.output
-    tables = (tmp_path / "out" / "again" / "experiments.toml").read_text()
+    assert "running_under_law.toml" in done.output, done.output
+    tables = (tmp_path / "out" / "again" / "running_under_law.toml").read_text()
     assert 'plant = "knee"' in tables and 'theta_l = "theta_l [rad]"' in tables
     rows = run(law, excite(20.0, 7))
     rows[:, 3] = 0.0  # the law alone, on a link that is held, as it was told

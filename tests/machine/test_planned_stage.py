@@ -77,7 +77,7 @@ def play(compiler, folder: Path, **faults):
             cwd=folder, capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
-    files += ["force_mpc.c", "active_set.c", "reference.c", "machine.c"]
+    files = [path.name for path in folder.glob("*.c")]  # all that is there, with the one program
     stated = [f"-D{name}={value}" for name, value in faults.items()]
     command = [*compiler, "-std=c99", "-O2", "-ffp-contract=off", *stated, *files, "-lm", "-o", "machine"]
     subprocess.run(command, cwd=folder, check=True)

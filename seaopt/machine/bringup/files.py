@@ -11,7 +11,7 @@ import numpy as np
 from seaopt.control import ForceMPC, export
 from seaopt.control.deploy.export import export_beside
 from seaopt.control.deploy.target import LOG_ROWS, Tare
-from seaopt.control.mpc.export import collect_code, write_code
+from seaopt.control.mpc.export import collect_code, list_sources
 from seaopt.control.mpc.stored import describe_mpc
 from seaopt.files import write_json, write_text
 from seaopt.logs import Log, write_log
@@ -132,8 +132,10 @@ def _export(stage: Stage, folder: Path, tare: Tare | None, fit_met: bool | None)
     options: dict[str, Any] = {"log_rows": LOG_ROWS, "tare": tare, "stop": stage.stop}
     uncertified = "" if stage.met else "the certificate of the law of this stage FAILED"
     if isinstance(source, ForceMPC):
-        code = write_code(collect_code(source), folder, uncertified=uncertified)
-        return [code, *export_beside(stage.controller, folder, **options)]
+        texts = list_sources(collect_code(source), uncertified=uncertified)
+        del texts["example.c"]  # the program is the stage's, or the user's: there is one main
+        files = [write_text(folder / name, text) for name, text in texts.items()]
+        return [*files, *export_beside(stage.controller, folder, **options)]
     options |= {"allow_infeasible": True, "fit_met": fit_met, "uncertified": uncertified}
     return [*export(source, folder, **options)]
 

@@ -48,8 +48,7 @@ LATER = (
     "line of that name, and tune again:"
 )
 ANOTHER = (
-    "if the machine is so, {}put the tables of again/experiments.toml into the problem file, fit these logs too, and "
-    "tune again:"
+    "if the machine is so, {}put the tables of again/*.toml into the problem file, fit these logs too, and tune again:"
 )
 NO_MODEL = "the machine was compared with no model, since the law was designed on none"
 UNCERTIFIED = {

@@ -270,6 +270,11 @@ def _list_notes(log: DescribedLog) -> Iterator[str]:
     count = log.survey.columns[0].values.size
     if count < FEW:
         yield f"{name}: {count} samples are few to tell columns and units by, or to fit; check the roles"
+    if log.survey.law:
+        yield (
+            f"{name}: was logged under a law, so that its input answers the noise of the sensor, and acts later than "
+            "its row: seaopt accept writes it as an experiment to fit"
+        )
     if traits.unexcited is not None:
         yield f"{name}: {replace(traits.unexcited, channel=log.roles.columns[log.roles.input].name).sentence}"
     if traits.delay_s is not None:

@@ -92,6 +92,7 @@ class LogSurvey:
     # which part of the log's time, s, all clocks have; None where there is one clock
     overlap_s: tuple[float, float] | None = None
     clock_units: Mapping[str, str] = field(default_factory=dict[str, str])  # of other clocks
+    law: str = ""  # of the law that wrote it; empty where it does not say
 
     @property
     def name(self) -> str:
@@ -163,6 +164,7 @@ def survey_log(path: Path, clock: str | None = None, units: Mapping[str, str] | 
         left_out=words | wrong | still | copies,
         overlap_s=overlap,
         clock_units={column.clock: _read_unit(column.clock, headers, raw) for column in moving if column.clock},
+        law=listing.law,
     )
 
 

@@ -1,6 +1,6 @@
 /* Constrained force control, written by seaopt: one step a sample, no allocation.
- * Compile force_mpc.c and active_set.c (example.c is a program around them), with
- *     cc -std=c99 -O2 -ffp-contract=off force_mpc.c active_set.c example.c -lm
+ * Compile force_mpc.c and active_set.c with your program (beside an exported law example.c is one), with
+ *     cc -std=c99 -O2 -ffp-contract=off force_mpc.c active_set.c program.c -lm
  * (fused products and sums round differently from Python; -ffast-math and -ffinite-math-only are refused, for they take
  * out the check for numbers that are not finite). */
 #ifndef FORCE_MPC_H
