@@ -48,6 +48,11 @@ class Difference:
         return from_content(cls, content, "a difference", remedy="correct that entry")
 
     @property
+    def width(self) -> float:
+        """Of its interval; infinite where none is stated."""
+        return math.inf if self.low is None or self.high is None else self.high - self.low
+
+    @property
     def is_there(self) -> bool:
         """Whether its interval excludes that there is none."""
         none = {"parameter": 1.0, "gain": 1.0, "delay": 0.0}.get(self.kind, math.inf)
