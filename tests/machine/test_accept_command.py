@@ -136,6 +136,8 @@ def test_the_reference_is_found_by_its_name_with_its_unit_or_without(folder, acc
     assert accept(folder / "x0.csv", "--reference", "goal").exit_code == 0
     wrong = accept(folder / "good.csv", "--reference", "goal")  # in place of which `reference` is not taken
     assert wrong.exit_code != 0 and 'no column "goal"' in str(wrong.exception)
+    wrong = accept(folder / "good.csv", "--reference", "goal [N]")  # no more alike by its unit
+    assert "did you mean" not in str(wrong.exception) and "known: time [s], reference [N]" in str(wrong.exception)
 
 
 def test_an_output_that_the_law_does_not_read_is_taken_where_its_column_is_stated(folder):

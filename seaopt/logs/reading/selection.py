@@ -238,20 +238,22 @@ def _explain_missing(places: Sequence[Source], name: str, wanted: Column) -> str
         numbers = ", ".join(map(str, repeated[:MAX_NAMES]))
         how = spell_column(column=repeated[0] or 1)
         return f'{len(repeated)} columns are named "{column}"; give the number of the one for {name}, {numbers}: {how}'
-    names = [field.name for field in fields]
-    near = get_close_matches(column, names, n=1, cutoff=0.6)
-    listed = f"seaopt inspect {shlex.quote(str(places[0].path))} --list"
+    names, listed = [field.name for field in fields], f"seaopt inspect {shlex.quote(str(places[0].path))} --list"
+    near = _find_near(column, names)
     key = name if wanted == Column(column=column) else "column"  # its unit and scale stay
-    how = f' write {key} = "{near[0]}"' if near else f"; list them: {listed}"
-    return f'no column "{column}" for {name}; {suggest_names(column, names)}{how}'
+    how = (
+        f'did you mean "{near}"? write {key} = "{near}"'
+        if near
+        else f"known: {_list_names(names)}; list them: {listed}"
+    )
+    return f'no column "{column}" for {name}; {how}'
 
 
-def suggest_names(name: str, names: Sequence[str]) -> str:
-    """Return what to say after an unknown name, however many names there are."""
-    if len(names) <= MAX_NAMES or get_close_matches(name, names, n=1, cutoff=0.6):
-        return suggestion(name, names)
-    shown = ", ".join(names[:MAX_NAMES])
-    return f"known: {shown}, ... ({len(names)} in all; contents(path), or seaopt inspect --list, lists them)"
+def _find_near(name: str, names: Sequence[str]) -> str | None:
+    """Return the header nearest to one by what stands before its unit: a unit that is the same makes none alike."""
+    bare = {bare_name(each): each for each in reversed(names)}
+    near = get_close_matches(bare_name(name), bare, n=1, cutoff=0.6)
+    return bare[near[0]] if near else None
 
 
 def _list_paths(sources: Sequence[Source]) -> str:
