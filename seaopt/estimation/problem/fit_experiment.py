@@ -17,6 +17,7 @@ from seaopt.estimation.problem.normal_equations import add_gram
 from seaopt.estimation.problem.shapes import Parts, PerOutput, Signal, Vector
 from seaopt.estimation.problem.steady_state_filter import SteadyStateFilter
 from seaopt.estimation.problem.unknowns import Slot, Slots, find_places
+from seaopt.parameters import Parameter
 from seaopt.records import record
 from seaopt.simulation import (
     Clock,
@@ -35,6 +36,8 @@ CACHED_SAMPLES = 1 << 14  # whose sums stay in a core's cache
 FIRST_SAMPLES = 8_000  # that tell the integration error in an output, and a filter's sizes and places
 MAX_SUBSTEPS = 256
 ROUNDED = 1.5  # times the rms of a rounding's error, up to which a residual is taken for that
+SLACK = 1e-9  # of a sample: rounding of a delay
+FIRST_PART = 20  # a segment is left out at its start for one of so many parts at most
 
 
 @record(eq=False)
@@ -393,18 +396,48 @@ def model_experiment(
     rows = zip(slots.offset, slots.drift, slots.gain, strict=True)
     sensors = [_indices([offset, *drift, gain]) for offset, drift, gain in rows]
     segments: list[FitSegment] = []
-    for samples, initial in zip(data.segments(holdout, model.plant), slots.initial, strict=True):
+    whole = data.segments(holdout, model.plant)
+    early = _count_early(data, whole)
+    for samples, initial in zip(whole, slots.initial, strict=True):
         state = _indices(initial)
         together = np.array([*shared, *noise, *state, *chain.from_iterable(sensors)], dtype=int)
         segments.append(
             FitSegment(
-                samples=samples,
+                samples=_leave_out(samples, early),
                 initial=initial,
                 predictor_columns=(together,) * len(sensors),
                 columns=tuple(np.array([*shared, *state, *row], dtype=int) for row in sensors),
             )
         )
     return {"model": model, "slots": slots, "theta": np.array(theta, dtype=int), "segments": tuple(segments)}
+
+
+def _count_early(data: Experiment, segments: Sequence[Segment]) -> int:
+    """Return how many samples of each segment may come before its first input takes effect, as late as the delay may
+    be. What was commanded until then is not in the log, unless it rests where the log begins. The estimated state is
+    one from which a simulation is right after the delay; before, a motor's position was 70 times its noise off.
+    """
+    delay = data.delay_s
+    if isinstance(delay, Parameter):
+        delay = delay.max if delay.free and np.isfinite(delay.max) else delay.value
+    if data.initial_state != "estimate" or data.shots > 1 or not any(_begins_in_motion(data, s) for s in segments):
+        return 0
+    shortest = min(samples.n for samples in segments)
+    return min(int(np.ceil(max(delay, 0.0) / data.log.period - SLACK)), shortest // FIRST_PART)
+
+
+def _begins_in_motion(data: Experiment, samples: Segment) -> bool:
+    """Tell whether an input is neither zero at a segment's start nor the same at the next sample."""
+    pairs = zip(data.plant.inputs, samples.inputs, strict=False)  # what a plant reads of itself comes after
+    firsts = [values[:2] for name, values in pairs if name != data.plant.clock]
+    return any(first[0] != 0.0 and np.ptp(first) > 0.0 for first in firsts)
+
+
+def _leave_out(samples: Segment, early: int) -> Segment:
+    """Return a segment without the first so many samples of its outputs."""
+    if not early:
+        return samples
+    return replace(samples, y=tuple(np.append(np.full(early, np.nan), channel[early:]) for channel in samples.y))
 
 
 def _indices(slots: Sequence[Slot]) -> list[int]:
