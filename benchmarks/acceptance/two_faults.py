@@ -69,6 +69,8 @@ def judge(stated, parts, truth):
     off = {name for name, value in truth.items() if value != {"delay": 0.0, "mode": np.inf}.get(name, 1.0)}
     if not {part.name for part in parts} <= off and any(off & {*part.alike} for part in parts):
         return None
+    if any(off >= {*names} for names in stated.unless):
+        return None
     return stated.low <= truth.get(stated.name, np.nan) <= stated.high
 
 
@@ -96,7 +98,7 @@ def run_subject(name, options):
                     lines.append(
                         f"    {seed} {key}: {part.name} {part.value:.4g} ({ends}), true {truth[part.name]:.4g}"
                     )
-                    lines[-1] += f" {part.alike}, left {found[0].left:.2f}: {holds}"
+                    lines[-1] += f" {part.alike} unless {part.unless}, left {found[0].left:.2f}: {holds}"
         total += held, said
         print(f"{name} {combination:28s} {held:3d} of {said:3d} hold; named {names}", flush=True)
         if lines:

@@ -128,13 +128,21 @@ def test_a_factor_at_the_end_of_what_is_tried_is_said_to_be_that_or_more():
 
 
 @pytest.mark.parametrize("left", [1.0, 9.0])
-def test_an_interval_says_that_nothing_else_may_differ(judged, tmp_path, left):
+def test_an_interval_says_what_else_may_differ(judged, tmp_path, left):
     """A loop 1 ms later with a fifth more friction was given as 0.936 ms (0.891 to 0.982), explained to the noise."""
     _, result = judged
     late = Difference(
         kind="delay", name="delay", value=9.36e-4, low=8.91e-4, high=9.82e-4, unit="s", explains=0.995, left=left
     )
-    differences = replace(result.differences, inside=False, found=(late,))
-    for text in read_everywhere(replace(result, differences=differences), tmp_path)[:2]:
-        assert "An interval holds where nothing but its row differs" in text
-        assert ("No row explains all of it to the noise." in text) == (left > result.differences.most_noise)
+    mode = replace(late, kind="mode", name="mode", value=40.0, low=39.0, high=41.0, unit="Hz")
+    either = replace(late, unless=(("N_p",), ("b_r", "J")))
+    for found in ((late,), (mode,), (late, mode), (either,)):
+        differences = replace(result.differences, inside=False, found=found)
+        for text in read_everywhere(replace(result, differences=differences), tmp_path)[:2]:
+            assert ("An interval holds where no more than two of" in text) == (found != (mode,))
+            assert ("hold where nothing else differs" in text) == (mode in found)
+            assert ("No row explains all of it to the noise." in text) == (left > result.differences.most_noise)
+            told = (
+                "The interval of delay holds unless one of these is off, too, which does what it does: N_p, b_r with J."
+            )
+            assert (told in text) == (either in found)

@@ -32,6 +32,7 @@ from seaopt.machine.differences.drift import Drift, find_drifts
 from seaopt.machine.differences.explanations import WORTH, explain
 from seaopt.machine.differences.joint import is_one_of
 from seaopt.machine.differences.leeway import take_spread
+from seaopt.machine.differences.others import state
 from seaopt.machine.differences.size_fit import Difference
 from seaopt.machine.response.judged import Measured, Prediction
 from seaopt.machine.response.periods import shorten
@@ -116,12 +117,13 @@ def compare(
     flat = [*_list_clipped(controller, [ticks.take(np.flatnonzero(ticks.complete)) for ticks in logs])]
     at = {name: each.value for name, each in nominal.items()}
     spread = take_spread(draws, at)
-    found = explain(comparison, beside, logs, model, spread)
+    found, left_over = explain(comparison, beside, logs, model, spread)
     misfits = [comparison.misfit(row) for row in drawn]
     best = int(np.argmin(misfits)) if misfits else None
     each_line = bool(np.all(share <= TOLERATED))
     together = each_line and is_one_of(comparison, spread, [model, *drawn], 1.0 - confidence)
     beyond = together and bool(found) and _is_beyond(comparison, values, found[0], model, reach)
+    found = [state(comparison, left_over, values, each) for each in found]
     drifts = find_drifts(controller, logs)
     alike = together and not flat and not beyond
     whose = {each.of_reading for each in drifts} - {False}

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from seaopt.control.loops.sampled_plant import DELAYS
 from seaopt.machine.differences.comparison import Comparison, Lines
 from seaopt.machine.differences.drive_limit import find_distortion, make_knob, take_limited, try_limit
 from seaopt.machine.differences.leeway import Spread, take_spread
@@ -35,10 +34,10 @@ from seaopt.machine.differences.size_search import (
     ROUNDS,
     STEP,
     SURE,
-    Knob,
     Search,
     Slopes,
     find_slopes,
+    list_knobs,
     make_delay,
     refine,
     step,
@@ -92,14 +91,15 @@ class Case:
 
 def explain(
     comparison: Comparison, beside: Comparison, logs: Sequence[Ticks], model: Lines, spread: Spread
-) -> list[Difference]:
-    """Return the causes that explain the misfit of a controller's design plant, the best first. `beside`: of what was
-    logged and the law does not read; `logs`: all of them; `spread`: of the certified machines.
+) -> tuple[list[Difference], Spread]:
+    """Return the causes that explain the misfit of a controller's design plant, the best first, and what certified
+    machines differ by beside them. `beside`: of what was logged and the law does not read; `logs`: all of them;
+    `spread`: of the certified machines.
     """
     assert comparison.controller.design is not None
     values, noise = comparison.controller.design[1], float(comparison.f.size)
     if (before := comparison.misfit(model)) <= WORTH * noise:
-        return []
+        return [], spread
     slopes = find_slopes(comparison, spread, values, model)
     left = SizeFit(comparison=comparison, leeway=spread.leave(slopes)).solve(lambda _: model, []).left
     if left <= WORTH * noise:  # draws explain it by themselves, and do not help to tell of what
@@ -113,7 +113,7 @@ def explain(
     tried = [*_try_parameters(case), *_try_shapes(case), *_try_rate(comparison, values, spread)]
     tried = _rank(each for each in tried if each.left < before)
     if not tried:
-        return []
+        return [], spread
     limited = take_limited(comparison, logs) if _may_be_limited(case, tried) else None
     limit, told = (None, False) if limited is None else _try_limit(case, tried, limited)
     if limit is not None:
@@ -121,13 +121,13 @@ def explain(
     kinds = _group(tried, noise)
     if tried[0].left > comparison.most_noise * noise:
         starts = _list_starts(case, kinds, limit, limited)
-        pairs = find_pairs(starts, _list_knobs(case), values, spread, tried, noise)
+        pairs = find_pairs(starts, list_knobs(comparison, values), values, spread, tried, noise)
         inside = tried[0].difference.low is not None  # else more of it than is tried may be all
         sought = _try_mode(case, _find_gain(tried)) if inside else ()
         modes = [each for each in sought if is_worth(each, tried[0].left, noise)]
         pairs = [*modes, *pairs] if modes and (not pairs or modes[0].rank < pairs[0].left) else pairs
         kinds = [*([pair] for pair in pairs), *kinds]
-    return _list_found(case, kinds, told=told)
+    return _list_found(case, kinds, told=told), spread
 
 
 def _rank(tried: Iterable[Tried]) -> list[Tried]:
@@ -209,21 +209,11 @@ def _try_limit(case: Case, tried: Sequence[Tried], limited: Comparison) -> tuple
     return limit, its * ALIKE <= others and limit.is_untold(best, case.noise)
 
 
-def _list_knobs(case: Case) -> list[Knob]:
-    """Return what may be another one of the machine."""
-    parameters = [
-        Knob(kind="parameter", parameter=each)
-        for name, each in case.comparison.plant.complete(case.values).items()
-        if each.value and name not in DELAYS
-    ]
-    return [*parameters, make_delay(case.comparison)]
-
-
 def _list_starts(
     case: Case, kinds: Sequence[Sequence[Tried]], limit: Tried | None, limited: Comparison | None
 ) -> list[Start]:
     """Return the best of each kind of causes that a second can be tried beside. `limited`: the model of `limit`."""
-    starts, knobs = list[Start](), {knob.parameter.name: knob for knob in _list_knobs(case)}
+    starts, knobs = list[Start](), {knob.parameter.name: knob for knob in list_knobs(case.comparison, case.values)}
     for kind in kinds:
         for each in kind:
             what, value = each.difference, each.difference.value
@@ -259,7 +249,7 @@ def _try_parameters(case: Case) -> Iterator[Tried]:
     comparison, values, spread = case.comparison, case.values, case.spread
     searches = [
         Search(knobs=(knob,), sizes=np.zeros(1), model=case.model, slopes=case.slopes)
-        for knob in _list_knobs(case)
+        for knob in list_knobs(comparison, values)
         if knob.kind == "parameter"
     ]
     done = refine(comparison, spread, values, searches)

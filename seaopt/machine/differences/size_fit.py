@@ -19,6 +19,7 @@ from seaopt.records import record
 UNTOLD = 5.4
 MODE_COST = 2.0  # by which a mode, of several sizes, has to leave less than another cause does
 RATE_COST = 2.0  # by which a usual rate may leave more than another cause does
+BESIDE_OTHERS = ("parameter", "gain", "delay")  # kinds whose intervals hold beside another difference
 SLIGHT = 1.5e-8  # of a size, for slopes
 
 
@@ -41,6 +42,7 @@ class Difference:
     changes_low: float | None = None  # its interval
     changes_high: float | None = None
     beside: tuple[Difference, ...] = ()  # what differs besides, of two that explain it together
+    unless: tuple[tuple[str, ...], ...] = ()  # others that do what it does: its interval is without them
     untold: bool = False  # the log does not tell it from the one that is named first
 
     @classmethod
@@ -51,6 +53,11 @@ class Difference:
     def width(self) -> float:
         """Of its interval; infinite where none is stated."""
         return math.inf if self.low is None or self.high is None else self.high - self.low
+
+    @property
+    def held_beside_others(self) -> bool:
+        """Whether its interval is to hold beside another difference that noise hides."""
+        return all(part.kind in BESIDE_OTHERS for part in (self, *self.beside))
 
     @property
     def is_there(self) -> bool:

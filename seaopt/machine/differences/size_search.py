@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Complex, Float
 
-from seaopt.control.loops.sampled_plant import DELAY
+from seaopt.control.loops.sampled_plant import DELAY, DELAYS
 from seaopt.machine.differences.comparison import Comparison, Lines
 from seaopt.machine.differences.leeway import Spread
 from seaopt.machine.differences.size_fit import Best, Difference, SizeFit, Tried
@@ -60,13 +60,17 @@ class Knob:
         tried.
         """
         far = SURE * std
-        name = "delay" if self.kind == "delay" else self.parameter.name
         told = far < MOST_SPREAD and all(abs(size - end) > FOUND for end in self.ends)
         value, low, high = map(self._measure, (size, size - far, size + far))
         return Difference(
-            kind=self.kind, name=name, unit=self._unit, explains=0.0,
+            kind=self.kind, name=self.name, unit=self._unit, explains=0.0,
             value=value, low=low if told else None, high=high if told else None,
         )  # fmt: skip
+
+    @property
+    def name(self) -> str:
+        """Under which it is stated."""
+        return "delay" if self.kind == "delay" else self.parameter.name
 
     @property
     def _unit(self) -> str:
@@ -93,6 +97,16 @@ def make_delay(comparison: Comparison) -> Knob:
     earliest = 0.0 if comparison.simulates else -float(law.compute_delay_samples)
     parameter = Parameter(name=DELAY, value=0.0, unit="s")
     return Knob(kind="delay", parameter=parameter, sample_time_s=law.sample_time_s, earliest=earliest)
+
+
+def list_knobs(comparison: Comparison, values: ParameterSet) -> list[Knob]:
+    """Return what may be another one of the machine."""
+    parameters = [
+        Knob(kind="parameter", parameter=each)
+        for name, each in comparison.plant.complete(values).items()
+        if each.value and name not in DELAYS
+    ]
+    return [*parameters, make_delay(comparison)]
 
 
 @record(eq=False)
@@ -127,11 +141,11 @@ class Search:
 
 def find_slopes(comparison: Comparison, spread: Spread, values: ParameterSet, model: Lines) -> Slopes:
     """Return what each value that was drawn adds to the logarithm of a model's response, for its own spread."""
-    moved = comparison.predict([_place(comparison, values, place) for place in spread.places])
+    moved = comparison.predict([place_draw(comparison, values, place) for place in spread.places])
     return np.log(np.array(moved).reshape(-1, model.size) / model)
 
 
-def _place(comparison: Comparison, values: ParameterSet, place: Mapping[str, float]) -> ParameterSet:
+def place_draw(comparison: Comparison, values: ParameterSet, place: Mapping[str, float]) -> ParameterSet:
     """Return values with those of a draw in place of the nominal; a loop that is earlier, as no draw is, stays so."""
     early = [parameter for name, parameter in values.items() if name == DELAY and parameter.value < 0.0]
     within = values.with_parameters(*(replace(parameter, value=0.0) for parameter in early))

@@ -115,10 +115,15 @@ TWO_AMPLITUDES = (
     "A limit of the drive and a smaller gain are told apart by a log at half the amplitude: a gain stays as it is."
 )
 IN_PART = "No row explains all of it to the noise."
-NOTHING_ELSE = (
-    "An interval holds where nothing but its row differs: beside a difference that noise hides, or that the row takes "
-    "up, the true size may be outside."
+TWO_AT_MOST = (
+    "An interval holds where no more than two of the model's values and its delay are others, named or hidden by "
+    "noise: beside more of them, or what the model lacks, the true size may be outside."
 )
+NOTHING_ELSE = (
+    "The intervals of a mode, a rate or a limit of the drive, and of what is named beside one, hold where nothing else "
+    "differs: beside a difference that noise hides, or that they take up, the true size may be outside."
+)
+UNLESS = "The interval of {} holds unless one of these is off, too, which does what it does: {}."
 BEGINS = (
     "Of {} the first {} are left out: in them the filter of the outer loop's velocity forgets what was before the log, "
     "which the log does not have."
@@ -332,8 +337,18 @@ def _remark(differences: Differences) -> tuple[str, ...]:
         if any(each.kind == "drive limit" for each in differences.found):
             remarks.append(TWO_AMPLITUDES)
     remarks += [] if differences.explained else [IN_PART]
-    remarks += [NOTHING_ELSE] if any(each.low is not None for each in differences.found) else []
-    return tuple(remarks)
+    return (*remarks, *_remark_on_intervals(differences.found))
+
+
+def _remark_on_intervals(found: Sequence[Difference]) -> Iterator[str]:
+    """Yield beside which other differences intervals hold."""
+    told = [each for each in found if each.low is not None]
+    if any(each.held_beside_others for each in told):
+        yield TWO_AT_MOST
+    if not all(each.held_beside_others for each in told):
+        yield NOTHING_ELSE
+    for part in (part for each in told for part in (each, *each.beside) if part.unless):
+        yield UNLESS.format(part.name, ", ".join(map(" with ".join, part.unless)))
 
 
 def _describe_replay(result: Acceptance) -> list[Section]:
