@@ -51,7 +51,7 @@ from seaopt.machine.ticks import AT_LIMIT, Ticks, find_edges
 from seaopt.records import record
 from seaopt.robustness import linear_controller
 
-SETTLED = 400  # rows over which the estimate of predictive control follows the log
+SETTLED = 400  # rows at most over which the estimate of predictive control follows the log
 COARSEST = 0.1  # of the command's rms, that rounding may allow of a replay that decides
 SAME_PLACE = 0.02  # of the span of a schedule's points: a variable that moves less stands still
 FLOOR = 1e-3  # of the command's variation: a mismatch below is none
@@ -160,9 +160,9 @@ def list_starts(setting: Setting) -> Iterator[tuple[State, int]]:
     law, ticks = setting.law, setting.ticks
     if isinstance(law, ForceMPC):
         yield law.start, 0
-        if len(ticks) > 2 * SETTLED:
-            state = _run_plan(law, ticks.take(slice(0, SETTLED)), law.start, follow=True)[1]
-            yield _refine_start(law, ticks.take(slice(SETTLED, 2 * SETTLED)), state), SETTLED
+        rows = min(SETTLED, len(ticks) // 3)
+        state = _run_plan(law, ticks.take(slice(0, rows)), law.start, follow=True)[1]
+        yield _refine_start(law, ticks.take(slice(rows, 2 * rows)), state), rows
         return
     yield law.reset(), 0
     first = ticks.measured[0]

@@ -115,6 +115,19 @@ def test_a_right_machine_is_accepted_by_the_log_that_its_ring_made(compiler, sta
     assert result.met and result.replays[0].largest < 1e-9, result
 
 
+def test_a_log_of_a_ring_that_was_full_is_of_the_law_between_its_gaps(compiler, stage, plan):
+    log, law = so.read_log(play(compiler, stage)[2]), plan.stages[0].source
+    row, other = np.arange(len(log)), force_mpc(STAND, THOR, replace(law.spec, bandwidth_hz=15))
+    for kept, stretches in (((row % 700 < 512) & (row < 3000), 5), (row % 2000 < 90, 9)):
+        columns = {name: np.round(log[name][kept], 4) for name in ("reference", "F1", "I")}
+        cut = so.Log.from_arrays(time=log.time[kept], **columns, units={"reference": "N", "F1": "N", "I": "A"})
+        result = so.accept(law, [cut])
+        (replayed,), (said,) = result.replays, result.left_out.values()
+        assert replayed.met and replayed.stretches == stretches, result
+        assert ("rows are missing, so that no period" in said) == (stretches == 9), said
+        assert not so.accept(other, [cut]).replayed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("fault", "size"), [({"GAIN": 0.5}, 0.5), ({"LATE": 2}, 2e-3)])
 def test_a_machine_with_a_fault_is_refused_and_the_fault_named(compiler, stage, plan, fault, size):

@@ -37,6 +37,7 @@ LIKE = 0.25  # of the autocorrelation at zero: what a period's is at least
 STEADY = 1e-9  # of the reference's range, a row: a ramp's steps differ by less
 MOST_LAGS = 50  # that are the likeliest periods, by either measure
 REPEATS = 0.2  # of the rows, that repeat after a period at least
+MOST_MISSING = 0.3  # of the rows, above which those that are left may not show a period
 SAME = 1e-4  # of the reference's range: rows that are alike
 WEAKEST = 1e-2  # of the strongest line
 NOT_PLAYED = 1e-3  # of the strongest line: what a rounded reference has where it has nothing
@@ -254,14 +255,20 @@ def say_left_out(left_out: LeftOut) -> list[str]:
     return [text.format(count) for count, text in counts if count]
 
 
-def _say_aperiodic(lasts_s: float, played: Played | None) -> str:
+def _say_aperiodic(ticks: Ticks, played: Played | None) -> str:
     """Return why there is no period in a log, and how long to record."""
+    lasts_s, missing = len(ticks) / ticks.rate_hz, int(np.sum(~ticks.complete))
     if played is not None and lasts_s < 2.0 * played.period_s:
         few = "shorter than one period" if lasts_s < played.period_s else "shorter than two periods"
         return (
             f"it lasts {lasts_s:.3g} s, {few} of its stage's reference, of {played.period_s:.3g} s each; record all of "
             f"that reference, {played.lasts_s:.4g} s, or at least the period that fades in and three after it, "
             f"{4.0 * played.period_s:.3g} s"
+        )
+    if missing > MOST_MISSING * len(ticks):
+        return (
+            f"{missing} of its {len(ticks)} rows are missing, so that no period of its reference is seen; log every "
+            "tick, and drain the ring before it is full"
         )
     return (
         f"its reference does not repeat within half of its {lasts_s:.3g} s, so that the loop's response cannot be told "
@@ -282,7 +289,7 @@ def cut_periods(
     """
     period, seconds = find_period(ticks.reference), 1.0 / ticks.rate_hz
     if period is None:
-        why = say_runaway(controller, ticks) or _say_aperiodic(len(ticks) * seconds, played)
+        why = say_runaway(controller, ticks) or _say_aperiodic(ticks, played)
         raise LogError(f"{ticks.source}: {why}")
     starts = _list_starts(ticks.reference, period)
     at_limit = np.abs(ticks.command) >= AT_LIMIT * (controller.command_limit or np.inf)
