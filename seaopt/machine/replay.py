@@ -91,6 +91,9 @@ def replay(source: Source, ticks: Ticks, others: Others | None = None) -> Replay
             causes = (stop,)
         elif (names := _find_open(whole, match, first)) is not None:
             causes = (Cause(kind="open loop", what=names, value=None, unit="", removes=1.0, explains=True),)
+        elif not (first and first.explains) and np.ptp(ticks.reference) == 0.0:
+            given = float(ticks.reference[0])
+            causes = (Cause(kind="still", what="reference", value=given, unit="", removes=1.0, explains=True),)
         elif first is not None and first.explains and play(replace(changed, rounded=False)).met:
             match = play(replace(whole, rounded=False))  # what is read in coarse steps is counts
     rate_hz, law_rate_hz = ticks.rate_hz, 1.0 / whole.controller.sample_time_s

@@ -103,6 +103,11 @@ def say_cause(cause: Cause, command: str) -> str:
                 f"the command does not follow {cause.what}: the loop was open; let the law make the command in each "
                 "tick of what was read, and record under a reference that moves"
             )
+        case "still":
+            return (
+                f"no command of this law is for a reference of {value} throughout, as it was logged: log the one that "
+                "the law was given; if it was that, another law ran"
+            )
         case "unit" if cause.what == command:
             return f"{cause.what} is in another unit: the logged value is {value} times what the law returned"
         case "unit":

@@ -112,3 +112,17 @@ def test_a_gate_that_tripped_of_readings_that_are_no_numbers_is_a_stop(compiler,
     first = result.replays[0].causes[0]
     assert (first.kind, first.what) == ("stopped", "command") and not result.met
     assert lost <= 1000.0 * first.value <= lost + 400
+
+
+def test_a_reference_that_is_zero_throughout_may_not_be_the_one_that_was_given(controller, bench):
+    """It said that the force is 0.1 times what it should be, and not what to log."""
+    log, still = bench.log(Machine(), REFERENCE), np.zeros(REFERENCE.size)
+    result = so.accept(
+        controller, [log.with_values(log.time, {name: log[name] for name in log.signals} | {"reference": still}, "")]
+    )
+    assert result.replays[0].causes[0].kind == "still" and not result.met
+    assert "log the one that the law was given" in " ".join(str(result).split())
+    rests = bench.log(Machine(), still)
+    assert so.accept(controller, [rests]).replays[0].met
+    turned = rests.with_values(rests.time, {name: rests[name] for name in rests.signals} | {"F1": -rests["F1"]}, "")
+    assert so.accept(controller, [turned]).replays[0].causes[0].kind == "sign"
