@@ -31,6 +31,7 @@ from seaopt.simulation import (
     run_passes,
     stream,
 )
+from seaopt.units import factor
 
 CACHED_SAMPLES = 1 << 14  # whose sums stay in a core's cache
 FIRST_SAMPLES = 8_000  # that tell the integration error in an output, and a filter's sizes and places
@@ -403,7 +404,7 @@ def model_experiment(
         together = np.array([*shared, *noise, *state, *chain.from_iterable(sensors)], dtype=int)
         segments.append(
             FitSegment(
-                samples=_leave_out(samples, early),
+                samples=_leave_out(samples, 0 if samples.lead else early),
                 initial=initial,
                 predictor_columns=(together,) * len(sensors),
                 columns=tuple(np.array([*shared, *state, *row], dtype=int) for row in sensors),
@@ -419,17 +420,21 @@ def _count_early(data: Experiment, segments: Sequence[Segment]) -> int:
     """
     delay = data.delay_s
     if isinstance(delay, Parameter):
-        delay = delay.max if delay.free and np.isfinite(delay.max) else delay.value
-    if data.initial_state != "estimate" or data.shots > 1 or not any(_begins_in_motion(data, s) for s in segments):
+        latest = delay.max if delay.free and np.isfinite(delay.max) else delay.value
+        delay = latest * (factor(delay.unit, "s") if delay.unit else 1.0)
+    first = [samples for samples in segments if not samples.lead]  # of shots the others have what was before them
+    if data.initial_state != "estimate" or not any(_begins_in_motion(data, samples) for samples in first):
         return 0
-    shortest = min(samples.n for samples in segments)
+    shortest = min(samples.n for samples in first)
     return min(int(np.ceil(max(delay, 0.0) / data.log.period - SLACK)), shortest // FIRST_PART)
 
 
 def _begins_in_motion(data: Experiment, samples: Segment) -> bool:
-    """Tell whether an input is neither zero at a segment's start nor the same at the next sample."""
+    """Tell whether an input is neither zero at a segment's start nor rests there: a command may be held for some rows
+    in motion, too.
+    """
     pairs = zip(data.plant.inputs, samples.inputs, strict=False)  # what a plant reads of itself comes after
-    firsts = [values[:2] for name, values in pairs if name != data.plant.clock]
+    firsts = [values[: max(2, samples.n // FIRST_PART)] for name, values in pairs if name != data.plant.clock]
     return any(first[0] != 0.0 and np.ptp(first) > 0.0 for first in firsts)
 
 

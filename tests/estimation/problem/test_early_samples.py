@@ -3,6 +3,8 @@ of scipy's fine lifted simulation of a mass on a spring, which was at rest witho
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, dlsim
@@ -57,9 +59,26 @@ def test_a_log_that_begins_in_motion_leaves_noise_alone(samples_late):
         ([15.0, -10.0], {"most_s": np.inf}, 1),  # up to where the search begins
         ([15.0, -10.0], {"initial_state": "rest"}, 0),
         ([0.0, 15.0], {}, 0),  # nothing is commanded yet
-        ([15.0, 15.0], {}, 0),  # rests
+        ([15.0] * (N // 20), {}, 0),  # rests
+        ([15.0] * 5, {}, 8),  # is held for some rows
+        ([15.0, -10.0], {"shots": 3}, 8),  # the first of them alone
     ],
 )
 def test_samples_are_left_out_where_an_earlier_current_is_still_in_force(first, options, left_out):
     fit = so.fit([bench_of(excite(first), 0.0, **options)], FREE, diagnostics=False)
     assert fit.samples == N - left_out
+
+
+@pytest.mark.parametrize(("options", "held"), [({"shots": 3}, 1), ({}, 5)])
+def test_noise_alone_is_left_of_a_log_in_shots_and_of_a_command_that_is_held_for_some_rows(options, held):
+    """The first samples left 1.7 times the noise of both."""
+    current = np.repeat(excite([15.0, -10.0, 8.0]), held)[:N]
+    fit = so.fit([bench_of(current, 1.4, **options)], FREE)
+    assert fit.outputs["log"]["q"].excess == pytest.approx(1.0, abs=0.05) and fit.met
+    so.testing.assert_recovered(fit, so.ParameterSet.of(M=(M, "kg"), b=(B, "N s/m"), G=(G, "N/A")), sigmas=4)
+
+
+def test_the_latest_delay_is_taken_in_its_unit():
+    delay = so.Parameter(name="delay_s", value=1.0, unit="ms", free=True, min=0.0, max=20.0)
+    data = replace(bench_of(excite([15.0, -10.0]), 0.0), delay_s=delay)
+    assert so.fit([data], FREE, diagnostics=False).samples == N - 8
