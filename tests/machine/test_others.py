@@ -10,7 +10,8 @@ import seaopt as so
 from seaopt.codec import from_content, to_content
 from seaopt.machine.differences import certified
 from seaopt.machine.differences.size_fit import Difference
-from tests.machine.simulator import Machine, multisine
+from tests.machine.conftest import SPEC
+from tests.machine.simulator import Bench, Machine, multisine
 from tests.machine.test_response import LINES
 
 RIGHT = Machine()
@@ -69,6 +70,24 @@ def test_a_single_faults_interval_stays_narrow(controller, bench, judge_alone, f
     alone, stated = judge_alone(controller, log).found[0], judge(controller, log).found[0]
     assert stated.name == alone.name == name and stated.low <= size <= stated.high, stated
     assert stated.high - stated.low < 2.5 * (alone.high - alone.low), (alone, stated)
+
+
+@pytest.mark.parametrize("damping", [1.0, 3.0])
+def test_a_parameter_of_the_plant_may_be_named_gain(compiler, tmp_path, damping):
+    """A motor of 0.7 of the torque was given as 15440 times, 15440 to 15440."""
+    stand = so.Plant(
+        name="stand", states={"x": "m", "v": "m/s"}, inputs={"I": "A"}, outputs={"F1": "N"},
+        parameters={"M": "kg", "b": "N s/m", "k": "N/m", "gain": "N/A"},
+        f=lambda t, x, u, p: {"x": x.v, "v": (p.gain * u.I - p.b * x.v - p.k * x.x) / p.M},
+        h=lambda t, x, u, p: {"F1": p.k * x.x},
+    )  # fmt: skip
+    parameters = {"M": (RIGHT.mass, "kg"), "b": (RIGHT.damping, "N s/m"), "k": (RIGHT.stiffness, "N/m")}
+    values = so.ParameterSet.of(**parameters, gain=(RIGHT.per_ampere, "N/A"))
+    bench = Bench(compiler, tmp_path, so.tune(stand, values, SPEC))
+    weak = replace(RIGHT, per_ampere=0.7 * RIGHT.per_ampere, damping=damping * RIGHT.damping)
+    first = so.accept(bench.controller, [bench.log(weak, REFERENCE, noise=2.0, seed=2)]).differences.found[0]
+    (gain,) = (part for part in (first, *first.beside) if part.name == "gain")
+    assert gain.low <= 0.7 <= gain.high and 0.002 < gain.high - gain.low < 0.02, first
 
 
 def test_what_is_named_is_stored_and_read():

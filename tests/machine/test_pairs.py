@@ -168,3 +168,11 @@ def test_a_mode_beside_a_gain_is_named_with_it(controller, bench, gain):
     mode, factor = find_part(first, "mode")[0], find_part(first, "gain")[0]
     assert mode.value == pytest.approx(40.0, rel=0.02) and factor.value == pytest.approx(gain, rel=0.01), first
     assert first.explains > 0.99 and len(first.beside) == 1, first
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_which_of_two_that_no_log_tells_apart_is_named_does_not_hang_on_rounding(controller, bench, seed):
+    """Beside a delay the efficiency was named of one log and the torque constant of another, by the twelfth digit."""
+    log = bench.log(replace(scale(per_ampere=0.7), delay_s=2e-3), multisine(1000, LINES, 10, 60.0, 3), seed=seed)
+    first = so.accept(controller, [log]).differences.found[0]
+    assert (first.name, first.alike) == ("K_tau", ("eta",)) and first.beside[0].name == "delay"

@@ -14,7 +14,7 @@ spring.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,7 +26,7 @@ from seaopt.machine.differences.comparison import Comparison, Lines
 from seaopt.machine.differences.drive_limit import find_distortion, make_knob, take_limited, try_limit
 from seaopt.machine.differences.leeway import Spread, take_spread
 from seaopt.machine.differences.pairs import Start, find_pairs, is_worth
-from seaopt.machine.differences.size_fit import Best, Difference, SizeFit, Tried
+from seaopt.machine.differences.size_fit import Best, Difference, SizeFit, Tried, drop_digits, rank
 from seaopt.machine.differences.size_search import (
     FOUND,
     MOST_SPREAD,
@@ -111,13 +111,13 @@ def explain(
         before=before,
     )  # fmt: skip
     tried = [*_try_parameters(case), *_try_shapes(case), *_try_rate(comparison, values, spread)]
-    tried = _rank(each for each in tried if each.left < before)
+    tried = rank(each for each in tried if each.left < before)
     if not tried:
         return [], spread
     limited = take_limited(comparison, logs) if _may_be_limited(case, tried) else None
     limit, told = (None, False) if limited is None else _try_limit(case, tried, limited)
     if limit is not None:
-        tried = [limit, *tried] if told else _rank((*tried, limit))
+        tried = [limit, *tried] if told else rank((*tried, limit))
     kinds = _group(tried, noise)
     if tried[0].left > comparison.most_noise * noise:
         starts = _list_starts(case, kinds, limit, limited)
@@ -128,18 +128,6 @@ def explain(
         pairs = [*modes, *pairs] if modes and (not pairs or modes[0].rank < pairs[0].left) else pairs
         kinds = [*([pair] for pair in pairs), *kinds]
     return _list_found(case, kinds, told=told), spread
-
-
-def _rank(tried: Iterable[Tried]) -> list[Tried]:
-    """Return causes, the best first; of those that no log can tell apart (torque constant, efficiency) that with the
-    widest interval, which holds for each of them, and not the one that rounding puts first.
-    """
-    return sorted(tried, key=lambda each: (_round(each.rank), -each.difference.width))
-
-
-def _round(misfit: float) -> float:
-    """Return a misfit to the digits that do not hang on the order of sums."""
-    return float(f"{misfit:.6g}")
 
 
 def _group(tried: Sequence[Tried], noise: float) -> list[list[Tried]]:
@@ -240,7 +228,7 @@ def _tell_apart(beside: Comparison, values: ParameterSet, kind: list[Tried]) -> 
     models = beside.predict([each.values or values for each in kind])
     gains = [1.0 if each.values else each.difference.value for each in kind]
     left = [beside.misfit(gain * lines) for gain, lines in zip(gains, models, strict=True)]
-    order = np.argsort([*map(_round, left)], kind="stable").tolist()
+    order = np.argsort([*map(drop_digits, left)], kind="stable").tolist()
     return [kind[k] for k in order if left[k] <= ALIKE * left[order[0]]]
 
 

@@ -47,6 +47,7 @@ WIDE = 2.0  # times that of nothing else: a std of which what makes it so is nam
 AT_ONCE = 2  # differences that are looked for
 TOGETHER = 3  # of which what is named may be
 GAIN = "gain"
+OF_ALL = ""  # the gain among sizes, where a parameter of the plant may be named gain
 
 Sizes = Float[np.ndarray, " n"]
 
@@ -131,10 +132,11 @@ def state(comparison: Comparison, spread: Spread, values: ParameterSet, differen
     if not difference.held_beside_others or any(part.low is None for part in parts):
         return difference
     knobs = {knob.parameter.name: knob for knob in list_knobs(comparison, values)}
-    names = (*dict.fromkeys((*knobs, *spread.names)), GAIN)
+    names = (*dict.fromkeys((*knobs, *spread.names)), OF_ALL)
     gain = next((part.value for part in parts if part.kind == GAIN), 1.0)
     moves = Moves(comparison=comparison, values=values, spread=spread, knobs=knobs, names=names, gain=gain)
-    own, sizes = [names.index(DELAY if part.kind == "delay" else part.name) for part in parts], np.zeros(len(names))
+    places = {"delay": DELAY, GAIN: OF_ALL}
+    own, sizes = [names.index(places.get(part.kind, part.name)) for part in parts], np.zeros(len(names))
     for k, part in zip(own, parts, strict=True):
         if part.kind != GAIN:
             sizes[k] = part.value / knobs[DELAY].sample_time_s if part.kind == "delay" else math.log(part.value)

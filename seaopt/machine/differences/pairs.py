@@ -10,7 +10,7 @@ import numpy as np
 
 from seaopt.machine.differences.comparison import TOLERATED, Comparison
 from seaopt.machine.differences.leeway import Spread
-from seaopt.machine.differences.size_fit import UNTOLD, Difference, Tried
+from seaopt.machine.differences.size_fit import UNTOLD, Difference, Tried, drop_digits, rank
 from seaopt.machine.differences.size_search import ROUNDS, Knob, Search, find_slopes, refine
 from seaopt.parameters import ParameterSet
 from seaopt.records import record
@@ -48,7 +48,7 @@ def find_pairs(
         return []
     late = [start for start in starts[FIRST:] if start.knob.kind == "delay"]  # what most often comes second
     searches = [(start, each) for start in (*starts[:FIRST], *late) for each in _begin(start, knobs, values, spread)]
-    searches.sort(key=lambda pair: pair[1].best.left if pair[1].best else np.inf)
+    searches.sort(key=lambda pair: drop_digits(pair[1].best.left) if pair[1].best else np.inf)
     found, seen = list[Tried](), list[set[str]]()
     for start, search in searches:
         if {*search.names} in seen:
@@ -58,8 +58,7 @@ def find_pairs(
         seen.append({*search.names})
         found += _search_on(start, search, values, spread)
     least, alone = min(each.left for each in singles), {each.difference.name: each.left for each in singles}
-    found = [_order(each, alone) for each in found if is_worth(each, least, noise)]
-    found.sort(key=lambda each: each.left)
+    found = rank(_order(each, alone) for each in found if is_worth(each, least, noise))
     return _fold([each for each in found if each.is_untold(found[0], noise)])
 
 

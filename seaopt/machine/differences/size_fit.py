@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,18 @@ class Tried:
         if self.difference.kind == "rate":
             return self.left / RATE_COST
         return self.left * (MODE_COST if self.difference.kind == "mode" else 1.0)
+
+
+def rank(tried: Iterable[Tried]) -> list[Tried]:
+    """Return causes, the best first; of those that no log can tell apart (torque constant, efficiency) that with the
+    widest interval, which holds for each of them, and not the one that rounding puts first.
+    """
+    return sorted(tried, key=lambda each: (drop_digits(each.rank), -drop_digits(each.difference.width)))
+
+
+def drop_digits(value: float) -> float:
+    """Return a misfit or a width to the digits that do not hang on the order of sums."""
+    return float(f"{value:.6g}")
 
 
 @record(eq=False)
