@@ -151,7 +151,7 @@ def _run_plan(
             line[-1, 0] = ticks.command[k] - result.state.terms[1] * law.per_effort
             kalman = law.kalman.go_on(line, state.kalman.corrected, state.kalman.innovation)
             state = replace(state, command=float(ticks.command[k]), kalman=kalman)
-    told = len(ticks) - law.spec.preview_samples
+    told = max(len(ticks) - law.spec.preview_samples, 0)
     return np.append(out[:told], ticks.command[told:]), state
 
 
@@ -160,9 +160,10 @@ def list_starts(setting: Setting) -> Iterator[tuple[State, int]]:
     law, ticks = setting.law, setting.ticks
     if isinstance(law, ForceMPC):
         yield law.start, 0
-        rows = min(SETTLED, len(ticks) // 3)
+        ahead = law.spec.preview_samples
+        rows = min(SETTLED, max(len(ticks) - ahead, 0) // 3)
         state = _run_plan(law, ticks.take(slice(0, rows)), law.start, follow=True)[1]
-        yield _refine_start(law, ticks.take(slice(rows, 2 * rows)), state), rows
+        yield _refine_start(law, ticks.take(slice(rows, 2 * rows + ahead)), state), rows
         return
     yield law.reset(), 0
     first = ticks.measured[0]
@@ -188,7 +189,7 @@ def _refine_start(law: ForceMPC, ticks: Ticks, state: MPCState) -> MPCState:
     modes, moved = np.empty((len(ticks), n)), np.eye(linear.c.size)[:, :n]
     for k in range(len(ticks)):
         modes[k], moved = linear.c @ moved, linear.a @ moved
-    left, told = ticks.command - _run_plan(law, ticks, state)[0], len(ticks) - law.spec.preview_samples
+    left, told = ticks.command - _run_plan(law, ticks, state)[0], max(len(ticks) - law.spec.preview_samples, 0)
     predicted = state.kalman.predicted + np.linalg.lstsq(modes[:told], left[:told], rcond=1e-10)[0]
     return replace(state, kalman=replace(state.kalman, predicted=predicted))
 

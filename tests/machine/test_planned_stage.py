@@ -16,6 +16,8 @@ import seaopt as so
 from seaopt.cli.main import app
 from seaopt.control import MPCSpec, force_mpc
 from seaopt.control.loops.compensation.terms import Compensation, GravityTerm
+from seaopt.machine import stepped
+from seaopt.machine.ticks import take_ticks
 from tests.c_code import CONVERSIONS, STRICT
 from tests.machine.test_bringup_command import PLANNED
 
@@ -126,6 +128,25 @@ def test_a_log_of_a_ring_that_was_full_is_of_the_law_between_its_gaps(compiler, 
         assert replayed.met and replayed.stretches == stretches, result
         assert ("rows are missing, so that no period" in said) == (stretches == 9), said
         assert not so.accept(other, [cut]).replayed
+
+
+@pytest.mark.parametrize(("preview", "rows"), [(25, 50), (25, 75), (45, 60)])
+def test_a_stretch_is_of_a_law_whose_preview_is_as_long_as_much_of_it(preview, rows):
+    """A third of the rows has fewer references ahead than the law takes."""
+    law = force_mpc(STAND, THOR, MPCSpec(current_limit_A=9.0, bandwidth_hz=20, preview_samples=preview))
+    time, state, made = np.arange(400) * law.spec.sample_time_s, law.start, list[float]()
+    reference = 100.0 * np.sin(2.0 * np.pi * (1.0 + 2.0 * time) * time)
+    read = 0.7 * np.roll(reference, 5) + np.random.default_rng(1).normal(size=time.size)
+    for k, force in enumerate(read.tolist()):
+        result = law.step(state, reference[k : k + preview + 1], force, [force])
+        made, state = [*made, result.command], result.state
+    log = so.Log.from_arrays(
+        time=time, reference=reference, F1=read, I=np.array(made), units={"reference": "N", "F1": "N", "I": "A"}
+    )
+    ticks = take_ticks(stepped.stand(law, None), log).take(slice(300, 300 + rows))
+    assert stepped.play(stepped.make_setting(law, ticks)).met
+    other = force_mpc(STAND, THOR, replace(law.spec, bandwidth_hz=15))
+    assert not stepped.play(stepped.make_setting(other, ticks)).met
 
 
 @pytest.mark.slow
