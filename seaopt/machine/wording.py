@@ -106,7 +106,7 @@ def say_cause(cause: Cause, command: str) -> str:
         case "still":
             return (
                 f"no command of this law is for a reference of {value} throughout, as it was logged: log the one that "
-                "the law was given; if it was that, another law ran"
+                "the law was given; if it was that, another law ran, or more than one column is wrong"
             )
         case "unit" if cause.what == command:
             return f"{cause.what} is in another unit: the logged value is {value} times what the law returned"

@@ -12,6 +12,7 @@ import pytest
 
 import seaopt as so
 from seaopt.errors import EstimationError, LogError
+from seaopt.estimation.judgement.traces.whitening import whiten
 
 RATE_HZ, SECONDS, STEPS = 500.0, 8.0, 10
 TRUTH = {"J_m": 2.4e-5, "b_r": 1.5e-4, "f_c": 0.02, "v_s": 5.0, "N": 100.0, "K_tau": 0.05, "k_s": 300.0, "c_s": 0.0}
@@ -130,3 +131,8 @@ def test_a_log_is_held_from_its_first_value_on_and_says_so():
     for wrong in ({"samples": 0}, {"samples": 2.0}, {"samples": 2, "first": -1}):
         with pytest.raises(LogError, match="is not a whole number; give"):
             log.hold("goal", **wrong)
+
+
+def test_a_residual_of_which_no_sample_is_there_is_not_looked_into():
+    """An output that begins late in a log made numpy warn of the mean of nothing."""
+    assert whiten(np.stack([np.full(100, np.nan), np.arange(100.0)])) is None

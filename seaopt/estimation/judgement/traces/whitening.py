@@ -15,8 +15,10 @@ def whiten(
     raw: Float[np.ndarray, "ny n"],
 ) -> tuple[Spectra, Float[np.ndarray, "ny f"]] | None:
     """Return the spectra of residuals, without their means, over what each has nearby, and what they were divided by,
-    as a response is to be, too; None where one of them is nothing.
+    as a response is to be, too; None where one of them is nothing, or not there.
     """
+    if not np.all(np.any(np.isfinite(raw), axis=1)):
+        return None
     raw = np.nan_to_num(raw - np.nanmean(raw, axis=1, keepdims=True))
     size = np.sqrt(np.sum(raw**2, axis=1, keepdims=True))
     if not np.all(size > 0.0):
