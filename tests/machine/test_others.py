@@ -72,6 +72,13 @@ def test_a_single_faults_interval_stays_narrow(controller, bench, judge_alone, f
     assert stated.high - stated.low < 2.5 * (alone.high - alone.low), (alone, stated)
 
 
+def test_what_is_there_beside_nothing_that_goes_with_the_log_alone_names_all_of_it(controller, bench):
+    """A torque of 0.84 that explains 41 % of dry friction and a delay had the interval of nothing else, and no word."""
+    machine = replace(RIGHT, coulomb=30.0, smoothing=1e-3, delay_s=1e-3)
+    torque = judge(controller, bench.log(machine, REFERENCE, noise=10.0, seed=2)).found[1]
+    assert torque.name == "K_tau" and torque.left > 4.0 and torque.unless, torque
+
+
 @pytest.mark.parametrize("damping", [1.0, 3.0])
 def test_a_parameter_of_the_plant_may_be_named_gain(compiler, tmp_path, damping):
     """A motor of 0.7 of the torque was given as 15440 times, 15440 to 15440."""

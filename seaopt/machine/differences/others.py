@@ -165,7 +165,7 @@ def state(comparison: Comparison, spread: Spread, values: ParameterSet, differen
                 found.append(at)
         unless.sort(key=lambda each: (len(each), each))
         said = [tuple(knobs[names[other]].name for other in each) for each in unless]
-        stated.append(_join(found, said) if found else part)
+        stated.append(_join(found or [part], said))
     return replace(stated[0], beside=tuple(stated[1:]))
 
 
