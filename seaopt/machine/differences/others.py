@@ -43,7 +43,7 @@ from seaopt.records import record
 
 FINE = 1e-5  # of a size, for the slopes of what has equations
 ROUNDS = 2  # of Gauss and Newton, to the certified machine that goes best with a difference
-WIDE = 2.0  # times that of nothing else: a std of which what makes it so is named
+WIDE = 2.0  # times the least of all: a std of which what makes it so is named
 AT_ONCE = 2  # differences that are looked for
 TOGETHER = 3  # of which what is named may be
 GAIN = "gain"
@@ -150,6 +150,8 @@ def state(comparison: Comparison, spread: Spread, values: ParameterSet, differen
     least = min(left for *_, left in solved)
     most = max(comparison.most_noise, least + UNTOLD * max(least, 1.0) / here.size)
     usable = sorted((each for each in solved if each[-1] <= most), key=lambda each: (len(each[0]), each[-1]))
+    if not usable:  # no model has numbers there
+        return difference
     narrow = WIDE * np.min([stds for _, _, stds, _ in usable], axis=0)
     count = max(AT_ONCE - len(parts), len(usable[0][0]))
     stated = list[Difference]()
