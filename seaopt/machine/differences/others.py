@@ -62,18 +62,7 @@ class Moves:
     knobs: Mapping[str, Knob]  # by parameter
     names: tuple[str, ...]  # of what has a size; the last is a gain's
     gain: float  # from which that one counts
-
-    @property
-    def drawn(self) -> Float[np.ndarray, "n n"]:
-        """The covariance of the draws' sizes, about none."""
-        spread, drawn = self.spread, np.zeros((len(self.names), len(self.spread.beyond)))
-        for name, at, size, beyond in zip(spread.names, spread.nominal, spread.sizes, spread.beyond.T, strict=True):
-            if name == DELAY:
-                beyond = beyond * size / self.knobs[name].sample_time_s
-            elif name in self.knobs:
-                beyond = np.log(np.maximum(1.0 + beyond * size / at, FINE))
-            drawn[self.names.index(name)] = beyond
-        return drawn @ drawn.T / max(len(spread.beyond), 1)
+    drawn: Float[np.ndarray, "n n"]  # covariance of the draws' sizes, about none
 
     def place(self, sizes: Sizes) -> ParameterSet:
         """Return the plant's values with sizes."""
@@ -106,7 +95,7 @@ class Moves:
         """Return by how much the best sizes, own ones beside some others, are off those that make a response; the std
         of the own ones; and what is left by line.
         """
-        free, drawn = [*own, *others], self.drawn
+        free, drawn = [*own, *others], self.drawn.copy()
         drawn[free] = drawn[:, free] = 0.0
         variances, axes = np.linalg.eigh(drawn)
         felt = variances > FELT**2 * variances[-1]
@@ -134,7 +123,10 @@ def state(comparison: Comparison, spread: Spread, values: ParameterSet, differen
     knobs = {knob.parameter.name: knob for knob in list_knobs(comparison, values)}
     names = (*dict.fromkeys((*knobs, *spread.names)), OF_ALL)
     gain = next((part.value for part in parts if part.kind == GAIN), 1.0)
-    moves = Moves(comparison=comparison, values=values, spread=spread, knobs=knobs, names=names, gain=gain)
+    moves = Moves(
+        comparison=comparison, values=values, spread=spread, knobs=knobs, names=names, gain=gain,
+        drawn=_find_covariance(spread, knobs, names),
+    )  # fmt: skip
     places = {"delay": DELAY, GAIN: OF_ALL}
     own, sizes = [names.index(places.get(part.kind, part.name)) for part in parts], np.zeros(len(names))
     for k, part in zip(own, parts, strict=True):
@@ -169,6 +161,18 @@ def state(comparison: Comparison, spread: Spread, values: ParameterSet, differen
         said = [tuple(knobs[names[other]].name for other in each) for each in unless]
         stated.append(_join(found or [part], said))
     return replace(stated[0], beside=tuple(stated[1:]))
+
+
+def _find_covariance(spread: Spread, knobs: Mapping[str, Knob], names: Sequence[str]) -> Float[np.ndarray, "n n"]:
+    """Return the covariance of the draws' sizes, about none."""
+    drawn = np.zeros((len(names), len(spread.beyond)))
+    for name, at, size, beyond in zip(spread.names, spread.nominal, spread.sizes, spread.beyond.T, strict=True):
+        if name == DELAY:
+            beyond = beyond * size / knobs[name].sample_time_s
+        elif name in knobs:
+            beyond = np.log(np.maximum(1.0 + beyond * size / at, FINE))
+        drawn[names.index(name)] = beyond
+    return drawn @ drawn.T / max(len(spread.beyond), 1)
 
 
 def _measure(moves: Moves, part: Difference, size: float, far: float) -> Difference:
