@@ -115,7 +115,7 @@ def accept_logs(
     content = write(result, session, logs)
     written = write_again(result, session)
     if written:
-        tables = join_words([str(path) for path in written[1::2]])
+        tables = join_words([str(path) for path in written if path.suffix == ".toml"])
         errors.wrap(f"note: to fit these logs too, put what is in {tables} into the problem file")
     files = [folder / FILE, folder / PAGE, *written]
     again = session.spell("certify" if stage is None else "bringup")

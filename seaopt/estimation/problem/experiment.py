@@ -310,7 +310,7 @@ class Experiment:
         check_options(self, EstimationError, f"experiment {self.name}: ")
         delay = self.delay_s
         if isinstance(delay, Parameter):
-            delay = delay.value * (factor(delay.unit, "s") if same_dimension(delay.unit, "s") else 1.0)
+            delay = delay.value * scale_to_seconds(delay)
         if isinstance(delay, bool) or not isinstance(delay, int | float) or not 0.0 <= delay < np.inf:
             raise self._refuse(f"delay_s = {delay!r} is not a time; give seconds, 0 or more")
         if delay > self.log.duration_s:
@@ -497,6 +497,11 @@ class Experiment:
     def _cuts(self, whole: slice) -> list[int]:
         """Return the rows at which a segment of the log is cut into shots, its ends included."""
         return (whole.start + cut_into_shots(whole.stop - whole.start, self.shots)).tolist()
+
+
+def scale_to_seconds(delay: Parameter) -> float:
+    """Return what makes seconds of a delay's value; 1 where it states no unit of time."""
+    return factor(delay.unit, "s") if same_dimension(delay.unit, "s") else 1.0
 
 
 def is_constant(values: Signal) -> bool:

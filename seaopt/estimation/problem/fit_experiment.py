@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from seaopt.estimation.problem.band import design_filter, sees_level
-from seaopt.estimation.problem.experiment import Experiment
+from seaopt.estimation.problem.experiment import Experiment, scale_to_seconds
 from seaopt.estimation.problem.losses import Loss
 from seaopt.estimation.problem.normal_equations import add_gram
 from seaopt.estimation.problem.shapes import Parts, PerOutput, Signal, Vector
@@ -31,7 +31,6 @@ from seaopt.simulation import (
     run_passes,
     stream,
 )
-from seaopt.units import factor
 
 CACHED_SAMPLES = 1 << 14  # whose sums stay in a core's cache
 FIRST_SAMPLES = 8_000  # that tell the integration error in an output, and a filter's sizes and places
@@ -421,7 +420,7 @@ def _count_early(data: Experiment, segments: Sequence[Segment]) -> int:
     delay = data.delay_s
     if isinstance(delay, Parameter):
         latest = delay.max if delay.free and np.isfinite(delay.max) else delay.value
-        delay = latest * (factor(delay.unit, "s") if delay.unit else 1.0)
+        delay = latest * scale_to_seconds(delay)
     first = [samples for samples in segments if not samples.lead]  # of shots the others have what was before them
     if data.initial_state != "estimate" or not any(_begins_in_motion(data, samples) for samples in first):
         return 0
