@@ -1,6 +1,8 @@
-"""The compiled passes: pass.c around CasADi's generated rate and output, or the exact matrices of a linear plant.
+"""The compiled passes: pass.c, with the exact matrices of a linear plant, or with step.c around CasADi's generated rate
+and output of another.
 
-A kernel of passes is compiled for each model; what they do to residuals (sums.c) once for all.
+Steps are compiled for each model, passes for each size of one, and what they do to residuals (sums.c) once for all;
+passes of several stretches side by side (lanes.c) have their steps in themselves.
 """
 
 from __future__ import annotations
@@ -21,9 +23,17 @@ from seaopt.plants.memo import memo
 from seaopt.records import record
 from seaopt.signals import VectorM, VectorX
 from seaopt.simulation.discretisation import Clock, transition
-from seaopt.simulation.integrator import output_function, rate_functions, step_function, write_in_lanes
+from seaopt.simulation.integrator import Rates, output_function, rate_functions, step_function, write_in_lanes
 from seaopt.simulation.model import Model
-from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, load_library, row_addresses
+from seaopt.simulation.native import (
+    Kernel,
+    define_constants,
+    find_kernel,
+    generate_code,
+    load_libraries,
+    load_library,
+    row_addresses,
+)
 from seaopt.simulation.parts import LANES, PARALLEL, count_parts, join_parts, moves_little
 from seaopt.simulation.passes import DoubleSum, Influence, Lagged, Layout, Pass, Point, Segment, Weights, layout_of
 
@@ -39,7 +49,10 @@ _FIELDS = (  # of seaopt_pass_args behind its channels; pointers are whole numbe
     (np.int64, ("from", "to", "length", "lead", "shared", "drift_terms", "v_columns", "lag_a", "lag_b", "lag_c")),
     (np.int64, ("settle", "start", "output_rows", "sections", "loss", "warm", "run_up")),
     (np.float64, ("t0", "tau0", "dtau")),
-    (np.uint64, ("model", "correction", "x0", "offset", "gain", "drift", "sos", "knee", "gram", "rho", "count")),
+    (
+        np.uint64,
+        ("plant", "model", "correction", "x0", "offset", "gain", "drift", "sos", "knee", "gram", "rho", "count"),
+    ),
     (np.uint64, ("outputs", "columns", "states", "changes", "carry")),
     *_INFLUENCES,  # in it
 )
@@ -67,50 +80,65 @@ def _count_delayed(model: Model, point: Point) -> int:
     return clock.delay_free * (2 if clock.hold == "first" or model.reads else 1)
 
 
-def kernel_source(model: Model, layout: Layout, delayed: int, *, measured: bool, in_lanes: bool = False) -> str:
-    """Return the C source of the passes of a model, over data with measured outputs or of simulations alone.
-    `in_lanes`: of several stretches side by side, where the plant is smooth.
+def pass_source(model: Model, layout: Layout, delayed: int, *, measured: bool) -> str:
+    """Return the C source of passes over data with measured outputs, or of simulations alone. Of a plant it has nothing
+    but sizes, and what a device samples: plants of one size share it.
     """
-    constants = {
-        "NX": model.nx,
-        "NU": model.nu,
-        "NY": model.ny,
-        "NJP": _pad_to_vectors(layout.states),
-        "NCP": _pad_to_vectors(layout.columns),
-        "LINEAR": int(model.linear),
-        "STEPPED": int(model.sticks and not model.by_events),
-        "JOINT": int(model.by_events),
-        "CORRECT": int(layout.corrected),
-        "DELAYED": delayed,
-        "MEASURED": int(measured),
-    }
-    generated, lanes = _write_sampling(model), list[str]()
+    constants = {**_name_sizes(model, layout, delayed, measured=measured), "LINEAR": int(model.linear)}
+    constants |= {"NCP": _pad_to_vectors(layout.columns), "CORRECT": int(layout.corrected)}
     if model.linear:
         constants["NI"] = model.nu * (1 + delayed) + _has_constant(model)
     else:
-        constants |= {"NQ": model.np, "READ": model.reads}
+        constants["READ"] = model.reads
+    headers = map(_text, ("sums.h", "stack.h", "layout.h", "step.h", "pass.h"))
+    return "\n".join((define_constants(constants), *headers, _write_sampling(model), _text("pass.c")))
+
+
+def step_source(model: Model, layout: Layout, delayed: int, *, measured: bool) -> str:
+    """Return the C source of the steps and outputs of a plant that is not linear."""
+    constants = _name_sizes(model, layout, delayed, measured=measured)
+    constants |= {"NQ": model.np, "STEPPED": int(model.sticks and not model.by_events), "JOINT": int(model.by_events)}
     if constants["STEPPED"]:
         step, output = step_function(model), output_function(model)
         plain = [_drop_derivatives(step, "seaopt_plain_step"), _drop_derivatives(output, "seaopt_plain_output")]
-        generated += generate_code(step, output, *plain)
-    elif not model.linear:
+        generated = generate_code(step, output, *plain)
+    else:
         rates = rate_functions(model, moving=delayed == 2)
-        patterns = (*rates.rate_pattern, *rates.output_pattern)
-        constants |= dict(zip(("NNZ_FX", "NNZ_FP", "NNZ_HX", "NNZ_HP"), (len(p) for p in patterns), strict=True))
-        if in_lanes and measured and not (layout.corrected or model.by_events or generated):
-            lanes = [write_in_lanes(function) for function in (rates.rate, rates.output)]
-            lanes = lanes if all(lanes) else []
-        if lanes:
-            constants["CONSTANTS"] = rates.rate.numel_in(4)
-            generated = "".join(lanes)
-        else:
-            generated += generate_code(rates.rate, rates.output, *([rates.joint] if model.by_events else []))
-        generated += _chain_code("rate", rates.rate_pattern, model.nx, in_lanes=bool(lanes))
-        generated += _chain_code("output", rates.output_pattern, model.ny, in_lanes=bool(lanes))
-    tanh = ("tanh.h",) if re.search(r"\btanh\(|seaopt_tanh", generated) else ()
-    headers = ("sums.h", "stack.h", "layout.h", *tanh, *(("lanes.h",) if lanes else ()), "pass.h")
-    body = _text("lanes.c" if lanes else "pass.c")
-    return "\n".join((define_constants(constants), *map(_text, headers), generated, body))
+        constants |= _count_nonzeros(rates)
+        generated = generate_code(rates.rate, rates.output, *([rates.joint] if model.by_events else []))
+        generated += _write_chains(model, rates, in_lanes=False)
+    headers = ("sums.h", "layout.h", "step.h", *(("tanh.h",) if re.search(r"\btanh\(", generated) else ()))
+    return "\n".join((define_constants(constants), *map(_text, headers), generated, _text("step.c")))
+
+
+def lanes_source(model: Model, layout: Layout, delayed: int) -> str:
+    """Return the C source of the passes of several stretches side by side; nothing of a plant that has none: it is
+    linear, sticks, samples, or has an operation that is not known of vectors.
+    """
+    if model.linear or model.sticks or layout.corrected or _write_sampling(model):
+        return ""
+    rates = rate_functions(model, moving=delayed == 2)
+    functions = [write_in_lanes(function) for function in (rates.rate, rates.output)]
+    if not all(functions):
+        return ""
+    constants = _name_sizes(model, layout, delayed, measured=True) | _count_nonzeros(rates)
+    constants |= {"NCP": _pad_to_vectors(layout.columns), "LINEAR": 0, "NQ": model.np, "READ": model.reads}
+    constants["CONSTANTS"] = rates.rate.numel_in(4)
+    generated = "".join((*functions, _write_chains(model, rates, in_lanes=True)))
+    tanh = ("tanh.h",) if "seaopt_tanh" in generated else ()
+    headers = ("sums.h", "stack.h", "layout.h", *tanh, "lanes.h", "pass.h")
+    return "\n".join((define_constants(constants), *map(_text, headers), generated, _text("lanes.c")))
+
+
+def _name_sizes(model: Model, layout: Layout, delayed: int, *, measured: bool) -> dict[str, float]:
+    """Return the constants of layout.h that passes and steps have in common."""
+    sizes = {"NX": model.nx, "NU": model.nu, "NY": model.ny, "NJP": _pad_to_vectors(layout.states)}
+    return {**sizes, "DELAYED": delayed, "MEASURED": int(measured)}
+
+
+def _count_nonzeros(rates: Rates) -> dict[str, float]:
+    patterns = (*rates.rate_pattern, *rates.output_pattern)
+    return {f"NNZ_{name}": len(each) for name, each in zip(("FX", "FP", "HX", "HP"), patterns, strict=True)}
 
 
 def _write_sampling(model: Model) -> str:
@@ -146,6 +174,12 @@ def _text(name: str) -> str:
     return files("seaopt.simulation").joinpath(name).read_text(encoding="utf-8")
 
 
+def _write_chains(model: Model, rates: Rates, *, in_lanes: bool) -> str:
+    """Return the C functions that take derivatives through the rate and the output."""
+    rate = _chain_code("rate", rates.rate_pattern, model.nx, in_lanes=in_lanes)
+    return rate + _chain_code("output", rates.output_pattern, model.ny, in_lanes=in_lanes)
+
+
 def _chain_code(
     name: str, pattern: tuple[list[tuple[int, int]], list[tuple[int, int]]], rows: int, *, in_lanes: bool
 ) -> str:
@@ -170,28 +204,39 @@ def _chain_code(
 
 
 @memo
-def load_passes(model: Model, layout: Layout, delayed: int, *, measured: bool, in_lanes: bool) -> Kernel | None:
-    """Return the compiled passes of a model, or None where there is no compiler."""
-    source = kernel_source(model, layout, delayed, measured=measured, in_lanes=in_lanes)
-    kernel = load_kernel(source, "seaopt_passes")
-    sums = _load_sums()
-    if kernel is None or sums is None:
+def load_passes(
+    model: Model, layout: Layout, delayed: int, *, measured: bool, in_lanes: bool
+) -> tuple[Kernel, int] | None:
+    """Return the compiled passes of a model, and the address of the steps that they take, 0 where they have them in
+    themselves; None where there is no compiler.
+    """
+    lanes = lanes_source(model, layout, delayed) if in_lanes and measured else ""
+    sources = {"seaopt_passes": lanes or pass_source(model, layout, delayed, measured=measured)}
+    sources["seaopt_sums"] = _sums_source()
+    if not (lanes or model.linear):
+        sources["seaopt_steps"] = step_source(model, layout, delayed, measured=measured)
+    libraries = load_libraries(sources)
+    if libraries is None:
         return None
-    table = ctypes.c_char.in_dll(sums, "seaopt_sums")
-    ctypes.c_void_p.in_dll(kernel.library, "sums").value = ctypes.addressof(table)
-    kernel.library.carry_size.restype = kernel.library.count_lanes.restype = ctypes.c_long
-    return kernel
+    passes, steps = libraries["seaopt_passes"], libraries.get("seaopt_steps")
+    ctypes.c_void_p.in_dll(passes, "sums").value = _address_in(libraries["seaopt_sums"], "seaopt_sums")
+    passes.carry_size.restype = passes.count_lanes.restype = ctypes.c_long
+    return find_kernel(passes, "seaopt_passes"), 0 if steps is None else _address_in(steps, "seaopt_steps")
 
 
-def _load_sums() -> ctypes.CDLL | None:
-    return load_library(_text("sums.h") + _text("sums.c"), "seaopt_sums")
+def _address_in(library: ctypes.CDLL, name: str) -> int:
+    return ctypes.addressof(ctypes.c_char.in_dll(library, name))
+
+
+def _sums_source() -> str:
+    return _text("sums.h") + _text("sums.c")
 
 
 def double_sum_of_columns(
     made: Pass, counted: Bool[np.ndarray, "n ny"], into: Influence, r: Lagged, *, forms: int
 ) -> DoubleSum | None:
     """Return what `Program.double_sum` does, of a pass whose columns are there."""
-    sums = _load_sums()
+    sums = load_library(_sums_source(), "seaopt_sums")
     if sums is None or made.columns is None:
         return None
     places = np.arange(into.shape[2]) if made.chosen is None else made.chosen
@@ -296,9 +341,15 @@ class Program:
     """The passes of one segment at one point, ready to run."""
 
     def __init__(
-        self, model: Model, segment: Segment, point: Point, weights: Weights, layout: Layout, kernel: Kernel
+        self,
+        model: Model,
+        segment: Segment,
+        point: Point,
+        weights: Weights,
+        layout: Layout,
+        compiled: tuple[Kernel, int],
     ) -> None:
-        self.model, self.segment, self.layout, self.kernel = model, segment, layout, kernel
+        self.model, self.segment, self.layout, (self.kernel, plant) = model, segment, layout, compiled
         self.memory: list[Any] = []  # arrays that stay alive while their addresses are in use
         data, ny = _linear_data(model, point, layout) if model.linear else _settings(model, point), model.ny
         base = np.zeros(1, dtype=_arguments(model.nu, ny))
@@ -311,7 +362,7 @@ class Program:
         base["lag_a"], base["lag_b"], base["lag_c"] = (*point.clock.lags, 0)[:3]
         base["tau0"], base["dtau"] = segment.drift_span
         base["settle"], base["sections"] = weights.settle, len(weights.sections)
-        base["loss"] = LOSSES.index(weights.loss)
+        base["loss"], base["plant"] = LOSSES.index(weights.loss), plant
         pointed = {"model": data, "sos": weights.sections, "knee": weights.knee}
         pointed |= {name: getattr(point, name) for name in ("offset", "gain", "drift")}
         if point.correction is not None:
@@ -320,7 +371,7 @@ class Program:
         for name, array in pointed.items():
             base[name] = self._address(array)
         self.base = base
-        self.joins = kernel.library.count_lanes() > 1  # whether parts may be joined, see `run_parts`
+        self.joins = self.kernel.library.count_lanes() > 1  # whether parts may be joined, see `run_parts`
         self.run_up = 0  # samples in which all of a state is forgotten, so that two halves may run at once; 0: serially
         filtered = layout.corrected or weights.settle or len(weights.sections)
         if model.linear and segment.n >= PARALLEL and not filtered:
@@ -334,8 +385,8 @@ class Program:
         """Return the program, or None where there is no compiler; `in_lanes`: one that may run in parts, if it can."""
         layout = layout_of(model.nx, model.ny, model.np, point)
         lanes, delayed = in_lanes and not len(weights.sections), _count_delayed(model, point)
-        kernel = load_passes(model, layout, delayed, measured=bool(segment.y), in_lanes=lanes)
-        return None if kernel is None else cls(model, segment, point, weights, layout, kernel)
+        compiled = load_passes(model, layout, delayed, measured=bool(segment.y), in_lanes=lanes)
+        return None if compiled is None else cls(model, segment, point, weights, layout, compiled)
 
     def _address(self, array: Any, kind: Any = float) -> int:
         """Return the address of an array's numbers, side by side."""

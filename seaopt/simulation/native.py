@@ -24,7 +24,6 @@ import hashlib
 import logging
 import os
 import platform
-import re
 import shutil
 import signal
 import stat
@@ -121,6 +120,16 @@ def load_library(source: str, name: str) -> ctypes.CDLL | None:
         with suppress(OSError):  # built for another machine that shares this folder
             return ctypes.CDLL(str(library))
     return None
+
+
+def load_libraries(sources: Mapping[str, str]) -> dict[str, ctypes.CDLL] | None:
+    """Return the libraries of C sources, by the name that each exports; None where one is missing. Those that are not
+    cached are compiled side by side.
+    """
+    with ThreadPoolExecutor(len(sources)) as pool:
+        loaded = dict(zip(sources, pool.map(load_library, sources.values(), sources), strict=True))
+    libraries = {name: library for name, library in loaded.items() if library is not None}
+    return libraries if len(libraries) == len(sources) else None
 
 
 def _digest(content: bytes) -> str:
@@ -249,8 +258,7 @@ def generate_code(*functions: ca.Function) -> str:
     generator = ca.CodeGenerator("kernel")
     for function in functions:
         generator.add(function)
-    names = "|".join(function.name() for function in functions)
-    code = re.sub(rf"CASADI_SYMBOL_EXPORT int ({names})\(", r"static inline int \1(", generator.dump())
+    code = generator.dump().replace("\nCASADI_SYMBOL_EXPORT ", "\nstatic inline ")
     sizes = {"ARG": ca.Function.sz_arg, "RES": ca.Function.sz_res, "IW": ca.Function.sz_iw, "W": ca.Function.sz_w}
     return define_constants({f"SZ_{name}": max(map(size, functions)) for name, size in sizes.items()}) + code
 
@@ -319,8 +327,11 @@ def _join(futures: list[Future[int]], interrupt: BaseException | None) -> bool:
 def load_kernel(source: str, name: str) -> Kernel | None:
     """Return the function `name` of a C source as a kernel; None where there is no compiler."""
     library = load_library(source, name)
-    if library is None:
-        return None
+    return None if library is None else find_kernel(library, name)
+
+
+def find_kernel(library: ctypes.CDLL, name: str) -> Kernel:
+    """Return the function `name` of a library as a kernel."""
     function = getattr(library, name)
     function.argtypes, function.restype = [ctypes.c_void_p, ctypes.c_long], ctypes.c_int
     return Kernel(function=function, library=library)

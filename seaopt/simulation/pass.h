@@ -26,6 +26,7 @@ typedef struct {
     long run_up;                   /* rows before `from` through which the state goes alone, from x0 */
     double t0;                     /* time of row 0 */
     double tau0, dtau;             /* drift's coordinate, -1 to 1 over the log, at row 0, and its step */
+    const struct plant_steps *plant; /* unless LINEAR, or in lanes */
     const double *model;           /* LINEAR: D (NX + NY)(NX + NI)(NJP), A (NX + NY)(NX); else the step's settings, then c */
     const double *correction;      /* CORRECT: NX x NY x NJP, gain and its derivatives */
     double *x0;                    /* NX: the state at the first row; where the state runs up alone, given at its first row and
@@ -49,7 +50,6 @@ typedef struct {
 
 EXPORTED const column_sums *sums; /* of sums.c, set by who loads this */
 
-#define INLINE static inline __attribute__((always_inline)) /* so that `wide` is a constant */
 #define ONCE static __attribute__((noinline)) /* what both ways of a pass share: compiling it twice takes longer than it saves */
 
 static inline void at(const seaopt_pass_args *a, long k, long lag, double *u) {

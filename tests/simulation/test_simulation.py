@@ -410,21 +410,21 @@ def test_an_overflow_is_said(thor):
 
 
 def test_other_parameter_values_need_no_other_code(swing, thor):
-    """Fixed parameters are data: the kernel's source depends on which are zero, not on their values."""
-    from seaopt.simulation.compiled import kernel_source
+    """Fixed parameters are data: the source of steps depends on which are zero, not on their values."""
+    from seaopt.simulation.compiled import step_source
 
     layout = Layout(shared=1, nx=4, ny=2, drift_terms=0, corrected=False)
-    a, b = (kernel_source(make_model(swing, thor.update(I_p=v), ("J",)), layout, 0, measured=True) for v in (0.2, 0.5))
+    a, b = (step_source(make_model(swing, thor.update(I_p=v), ("J",)), layout, 0, measured=True) for v in (0.2, 0.5))
     assert a == b
 
 
 def test_other_unknowns_of_a_linear_plant_need_no_other_code(stand, thor):
     """Their count, and that of drift terms, are data, in the room of whole vectors."""
-    from seaopt.simulation.compiled import kernel_source
+    from seaopt.simulation.compiled import pass_source
 
     def source(free, drift_terms):
         layout = Layout(shared=len(free), nx=2, ny=2, drift_terms=drift_terms, corrected=False)
-        return kernel_source(make_model(stand, thor, free), layout, 0, measured=True)
+        return pass_source(make_model(stand, thor, free), layout, 0, measured=True)
 
     assert source(("J", "b_r"), 0) == source(("J", "b_r"), 1) == source(("k", "eta", "b_r"), 0)
 
