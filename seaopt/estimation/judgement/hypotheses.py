@@ -8,7 +8,7 @@ such as play, have no slope there, and start from a size that actuators have.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields, replace
 
 import casadi as ca
@@ -35,6 +35,8 @@ from seaopt.simulation import simulate
 
 FASTEST = 2.0  # of the rate of a log: a pole beyond it does nothing that the log shows, and takes ever shorter steps
 LARGEST = 0.999  # quantile of a size over a log: what it has at its largest, but for rounding
+LEVEL = 0.05  # of the largest command: what is so near to it, or to zero, is there
+BETWEEN = 0.02  # of the samples that may be elsewhere
 SIMULATED = 1e-2  # of a signal: error of the simulation that tells sizes
 
 Starts = Sequence[Mapping[str, float]]
@@ -57,6 +59,14 @@ class Sizes:
 SIZES = tuple(each.name for each in fields(Sizes) if each.name not in ("ripple", "holds"))
 
 
+@record
+class Scale:
+    """What the size of an effect that a log may not show goes by."""
+
+    stiffness: float  # of the spring; 0 where no role tells
+    level: float  # the one size that all commands have where they are not zero; 0 where they have several
+
+
 @record(eq=False)
 class Hypothesis:
     """What a model may lack: in words, the part that brings it, and from which values of its own a refit starts.
@@ -64,7 +74,7 @@ class Hypothesis:
     Those that it frees are the first of each start; `fixed` are chosen once. What is `searched` is free in the refit
     alone, and fixed at its value where the effect is taken: logs hardly tell how large it is. `poles` are in Hz, a
     `dead_time` in s: alone it is an experiment's own delay, and named as that (`candidates`).
-    `usual` is of what logs often do not show at all: a size that actuators have, with a spring of that stiffness
+    `usual` is of what logs often do not show at all: a size that actuators have of this scale, 0 where logs do show it
     (`silence`); `built_in` the parameter by which a plant has it without the part. One that `holds` the commands of the
     logs frees nothing, and may need no part. What goes `further` is tried where the hypothesis is the best and takes
     half of the excess, but leaves some: by itself it would take a part of much else.
@@ -77,7 +87,7 @@ class Hypothesis:
     searched: tuple[str, ...] = ()
     poles: tuple[str, ...] = ()
     dead_time: str | None = None
-    usual: Callable[[float], float] | None = None
+    usual: Callable[[Scale], float] | None = None
     holds: bool = False
     further: Hypothesis | None = None
     built_in: Callable[[Plant], str | None] = lambda plant: None
@@ -113,6 +123,7 @@ HYPOTHESES = (
         effect="the motor's torque droops at large currents",
         part="droop",
         starts=lambda s: [{"a_i": 0.1 / s.current**2}] if s.current else [],
+        usual=lambda s: 0.1 / s.level**2 if s.level else 0.0,
     ),
     Hypothesis(effect="the motor's torque falls with its speed", part="falling_torque", starts=_zero("a_v")),
     Hypothesis(effect="the spring hardens", part="hardening", starts=_zero("k_3")),
@@ -163,7 +174,7 @@ HYPOTHESES = (
         effect="the spring is damped",
         part="spring_damping",
         starts=_zero("c_k"),
-        usual=lambda stiffness: 1e-3 * stiffness,
+        usual=lambda s: 1e-3 * s.stiffness,
         built_in=lambda plant: None if plant.spring is None else plant.spring.damper,
     ),
     Hypothesis(
@@ -207,13 +218,13 @@ HYPOTHESES = (
         effect="the stand is compliant",
         part="stand",
         starts=lambda s: [{"c_t": 0.02 / s.stiffness}] if s.stiffness else [],
-        usual=lambda stiffness: 0.04 / stiffness,
+        usual=lambda s: 0.04 / s.stiffness if s.stiffness else 0.0,
     ),
     Hypothesis(
         effect="friction differs between driving and back-driving",
         part="back_driving",
         starts=_zero("d_e"),
-        usual=lambda stiffness: 0.05,
+        usual=lambda s: 0.05 if s.stiffness else 0.0,
     ),
 )
 
@@ -271,8 +282,10 @@ def list_additions(problem: FitProblem, z: Vector) -> Iterator[Addition]:
     params = problem.params.with_parameters(*fitted)
     data = {experiment.name: experiment.data for experiment in problem.experiments}
     plants = {name: experiment.plant for name, experiment in data.items()}
+    scale = _measure_scale(data.values(), params)
     for hypothesis in HYPOTHESES:
-        if hypothesis.usual is None:
+        size = hypothesis.usual(scale) if hypothesis.usual is not None else 0.0
+        if not size:
             continue
         changed, names = dict[str, Plant](), set[str]()
         for experiment, plant in plants.items():
@@ -287,22 +300,38 @@ def list_additions(problem: FitProblem, z: Vector) -> Iterator[Addition]:
             continue
         (name,) = names
         first, plant = next(iter(changed.items()))
-        parameter, spring, is_there = plant.parameters[name], plant.spring, name in plants[first].parameters
+        parameter, is_there = plant.parameters[name], name in plants[first].parameters
         if is_there:
             parameter = params[name]
         elif name in params:
             continue
-        if not isinstance(parameter, Parameter) or parameter.free or spring is None or not spring.stiffness:
+        if not isinstance(parameter, Parameter) or parameter.free:
             continue
-        stiffness = plant.complete(data[first].apply_own(params))[spring.stiffness].value
         plants = plants | changed
         yield Addition(
             effect=hypothesis.effect + (" more" if parameter.value else ""),
             part="" if is_there else hypothesis.part,
             parameter=parameter,
-            size=hypothesis.usual(stiffness),
+            size=size,
             plants=plants,
         )
+
+
+def _measure_scale(experiments: Iterable[Experiment], params: ParameterSet) -> Scale:
+    """Return the stiffness of a spring, and the size of commands that are a pulse or a square wave: such logs are the
+    same whatever a motor makes of other currents.
+    """
+    stiffness, commands = 0.0, [np.zeros(1)]
+    for experiment in experiments:
+        plant = experiment.plant
+        if not stiffness and plant.spring is not None and plant.spring.stiffness:
+            stiffness = plant.complete(experiment.apply_own(params))[plant.spring.stiffness].value
+        if plant.actuation is not None:
+            commands.append(np.abs(experiment.log.signals[plant.actuation.input].values))
+    sizes = np.concatenate(commands)
+    level = float(np.nanmax(sizes))
+    between = float(np.mean((sizes > LEVEL * level) & (sizes < (1.0 - LEVEL) * level)))
+    return Scale(stiffness=stiffness, level=level if between < BETWEEN else 0.0)
 
 
 @memo

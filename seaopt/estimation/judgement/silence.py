@@ -2,8 +2,9 @@ r"""What no such log can tell: effects that other values of a fit's parameters m
 
 A stand that gives is in series with the spring. A transmission that rubs more where it drives than where it is driven
 is one with another inertia, friction and efficiency. A damper across a spring whose other end is held is friction of
-the motor. No residual shows any of them, so that each is looked for where it is not: its parameter :math:`\delta` joins
-the unknowns at its neutral value, zero, or where it is fixed, with the sensitivities of all of them,
+the motor. A motor whose torque droops is a weaker one where all commands have one size. No residual shows any of them,
+so that each is looked for where it is not: its parameter :math:`\delta` joins the unknowns at its neutral value, zero,
+or where it is fixed, with the sensitivities of all of them,
 
 .. math:: s^2 = H_{\delta\delta} - H_{\delta\theta} H_{\theta\theta}^{-1} H_{\theta\delta}, \qquad
           \frac{d\theta}{d\delta} = -H_{\theta\theta}^{-1} H_{\theta\delta} .

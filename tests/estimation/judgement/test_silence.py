@@ -16,13 +16,26 @@ SCREW = {"m_l": 0.646, "k": 655e3, "l": 0.002, "N_p": 3.0, "K_tau": 0.0255, "J":
          "v_s": 2e-3}  # fmt: skip
 
 
-def record(*, linear=False, give=0.0, driving=0.0, driven=0.0, damping=0.0, hardening=0.0, play=0.0):
+def record(
+    *,
+    linear=False,
+    give=0.0,
+    driving=0.0,
+    driven=0.0,
+    damping=0.0,
+    hardening=0.0,
+    play=0.0,
+    make_current=None,
+    droop=0.0,
+):
     """Return the log of a motor on a held spring, in series with a stand that gives by a share of the spring; friction
     grows by shares of the spring's effort, where the motor drives it and where it drives the motor. `damping` is a
-    damper's across a gear's spring, which hardens by a cubic stiffness, behind a play of twice `play`.
+    damper's across a gear's spring, which hardens by a cubic stiffness, behind a play of twice `play`. A current of its
+    own is made of the times; of each a share `droop` times its square makes no torque.
     """
     p = SCREW if linear else ROTARY
     t, current = drive(6.0, RATE_HZ, 2.5, seed=1, top_hz=25.0)
+    current = current if make_current is None else make_current(t)
     lead = p["l"] / (2 * math.pi * p["N_p"]) if linear else 1.0
     ratio, spring = (1.0, p["k"]) if linear else (p["N"], p["k_s"])
     inertia = p["J"] / lead**2 + p["m_l"] if linear else p["J_m"]
@@ -39,7 +52,8 @@ def record(*, linear=False, give=0.0, driving=0.0, driven=0.0, damping=0.0, hard
         rub = level * math.tanh(speed / p["v_s"]) + p["b_r"] / lead**2 * speed
         rub += damping / ratio**2 * speed
         rub += 0.5 * (driving - driven) * effort  # where it slides: more against the spring than with it
-        return speed, (p["K_tau"] / lead * ampere - rub - effort) / inertia
+        push = p["K_tau"] / lead * ampere * (1.0 - droop * ampere**2)
+        return speed, (push - rub - effort) / inertia
 
     place, speed = integrate(rates, 2, current, 1.0 / RATE_HZ, 4)
     noise, effort = np.random.default_rng(2), pull(place) * ratio + damping * speed / ratio
@@ -136,6 +150,28 @@ def test_a_fixed_damping_of_the_spring_is_said_to_touch_the_motors():
     assert right.met
     assert right.parameters["b_r"].value == pytest.approx(ROTARY["b_r"], rel=3e-3)
     assert "b_r where the spring is damped more" in " ".join(repr(right).split())
+
+
+@pytest.mark.parametrize(("least", "touched"), [(0.0, ("eta",)), (-2.5, ("J_m", "b_r", "f_c", "k_s"))])
+def test_a_motor_that_droops_is_said_to_touch_all_that_scales_where_commands_have_one_size(least, touched):
+    """A tenth less of torque at the one current that there is: no other log of such commands is another. A torque that
+    is measured leaves it to the efficiency; without one all that scales with torques is less.
+    """
+
+    def switch(t):
+        return np.where(t * (1.0 + t) % 2.0 < 1.0, 2.5, least)
+
+    log = record(make_current=switch, droop=0.1 / 2.5**2)
+    if "eta" not in touched:
+        channels = {name: log[name] for name in ("I", "theta_m")}
+        log = so.Log.from_arrays(time=log.time, **channels)
+    result = fit(log, free=("J_m", "b_r", "f_c", "k_s", *(["eta"] if "eta" in touched else [])))
+    values = follow(result, "droop", 0.1 / 2.5**2)
+    assert result.met
+    assert values.keys() == set(touched)
+    for name, value in values.items():
+        assert value == pytest.approx({"eta": 1.0}.get(name) or ROTARY[name], rel=0.02), name
+    assert "where the motor's torque droops at large currents" in " ".join(repr(result).split())
 
 
 def test_what_a_log_does_tell_is_not_named():
