@@ -30,7 +30,6 @@ from seaopt.simulation.native import (
     define_constants,
     find_kernel,
     generate_code,
-    load_libraries,
     load_library,
     row_addresses,
 )
@@ -215,9 +214,12 @@ def load_passes(
     sources["seaopt_sums"] = _sums_source()
     if not (lanes or model.linear):
         sources["seaopt_steps"] = step_source(model, layout, delayed, measured=measured)
-    libraries = load_libraries(sources)
-    if libraries is None:
-        return None
+    libraries = dict[str, ctypes.CDLL]()
+    for name, source in sources.items():
+        library = load_library(source, name)
+        if library is None:
+            return None
+        libraries[name] = library
     passes, steps = libraries["seaopt_passes"], libraries.get("seaopt_steps")
     ctypes.c_void_p.in_dll(passes, "sums").value = _address_in(libraries["seaopt_sums"], "seaopt_sums")
     passes.carry_size.restype = passes.count_lanes.restype = ctypes.c_long

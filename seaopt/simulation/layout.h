@@ -8,6 +8,7 @@
      the last ones, that are readings, of the log's own time, and joined by curves;
    of steps NQ: parameters with derivatives; STEPPED, JOINT 0 or 1; NNZ_FX, NNZ_FP, NNZ_HX, NNZ_HP: nonzero derivatives. */
 #include <math.h>
+#include <string.h>
 
 #define MAX_SECTIONS 8
 

@@ -122,16 +122,6 @@ def load_library(source: str, name: str) -> ctypes.CDLL | None:
     return None
 
 
-def load_libraries(sources: Mapping[str, str]) -> dict[str, ctypes.CDLL] | None:
-    """Return the libraries of C sources, by the name that each exports; None where one is missing. Those that are not
-    cached are compiled side by side.
-    """
-    with ThreadPoolExecutor(len(sources)) as pool:
-        loaded = dict(zip(sources, pool.map(load_library, sources.values(), sources), strict=True))
-    libraries = {name: library for name, library in loaded.items() if library is not None}
-    return libraries if len(libraries) == len(sources) else None
-
-
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 

@@ -1,5 +1,4 @@
 /* What a pass is asked for, and what all kinds of passes need: see pass.c, lanes.c. */
-#include <string.h>
 #if defined(__SSE2__)
 #include <xmmintrin.h>
 #endif

@@ -296,4 +296,4 @@ static void plain_output(double (*z)[NJP], double t, const double *u, const doub
     output(&(hot){z, work}, t, u, du, c, y, 1);
 }
 
-EXPORTED const plant_steps seaopt_steps = {{plain_step, derived_step}, {plain_output, derived_output}, sizeof(double) * (SZ_W + 1)};
+EXPORTED const plant_steps seaopt_steps = {{plain_step, derived_step}, {plain_output, derived_output}, 2 * sizeof(double) * (SZ_W + 1)};

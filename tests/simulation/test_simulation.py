@@ -418,6 +418,35 @@ def test_other_parameter_values_need_no_other_code(swing, thor):
     assert a == b
 
 
+def test_plants_of_one_size_share_their_passes():
+    """Only steps have a plant's equations, of a hanging mass as of a van der Pol oscillator."""
+    from seaopt.simulation.compiled import pass_source, step_source
+
+    def make(name, rate):
+        return so.Plant(
+            name=name, states={"x": "m", "v": "m/s"}, inputs={"u": "N"}, outputs={"x": "m"}, parameters={"a": "-"},
+            f=lambda t, x, u, p: {"x": x.v, "v": rate(x, p) + u.u}, h=lambda t, x, u, p: {"x": x.x},
+        )  # fmt: skip
+
+    swinging = make("swinging", lambda x, p: -p.a * ca.sin(x.x))
+    ringing = make("ringing", lambda x, p: p.a * (1 - x.x**2) * x.v - x.x)
+    params, layout = so.ParameterSet.of(a=(1.3, "-")), Layout(shared=1, nx=2, ny=1, drift_terms=0, corrected=False)
+    models = [make_model(plant, params, ("a",)) for plant in (swinging, ringing)]
+    passes = [pass_source(model, layout, 0, measured=True) for model in models]
+    steps = [step_source(model, layout, 0, measured=True) for model in models]
+    assert passes[0] == passes[1]
+    assert steps[0] != steps[1]
+
+    t = np.arange(600) / 200
+    log = so.Log.from_arrays(time=t, u=np.full(t.size, 0.3))
+    rates = (lambda x: -1.3 * np.sin(x[0]), lambda x: 1.3 * (1 - x[0] ** 2) * x[1] - x[0])
+    for plant, rate in zip((swinging, ringing), rates, strict=True):
+        right = solve_ivp(
+            lambda _, x, rate=rate: (x[1], rate(x) + 0.3), (0.0, 3.0), [0.0, 0.0], t_eval=t, rtol=1e-10, atol=1e-12
+        )
+        assert so.simulate(plant, params, log)["x"] == pytest.approx(right.y[0], abs=1e-6)
+
+
 def test_other_unknowns_of_a_linear_plant_need_no_other_code(stand, thor):
     """Their count, and that of drift terms, are data, in the room of whole vectors."""
     from seaopt.simulation.compiled import pass_source

@@ -8,7 +8,7 @@ such as play, have no slope there, and start from a size that actuators have.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, fields, replace
 
 import casadi as ca
@@ -31,6 +31,7 @@ from seaopt.plants.memo import memo
 from seaopt.plants.parts import list_dead_times
 from seaopt.plants.plant import name_input, name_symbols
 from seaopt.records import record
+from seaopt.signals import VectorN
 from seaopt.simulation import simulate
 
 FASTEST = 2.0  # of the rate of a log: a pole beyond it does nothing that the log shows, and takes ever shorter steps
@@ -282,10 +283,8 @@ def list_additions(problem: FitProblem, z: Vector) -> Iterator[Addition]:
     params = problem.params.with_parameters(*fitted)
     data = {experiment.name: experiment.data for experiment in problem.experiments}
     plants = {name: experiment.plant for name, experiment in data.items()}
-    scale = _measure_scale(data.values(), params)
     for hypothesis in HYPOTHESES:
-        size = hypothesis.usual(scale) if hypothesis.usual is not None else 0.0
-        if not size:
+        if hypothesis.usual is None:
             continue
         changed, names = dict[str, Plant](), set[str]()
         for experiment, plant in plants.items():
@@ -305,7 +304,8 @@ def list_additions(problem: FitProblem, z: Vector) -> Iterator[Addition]:
             parameter = params[name]
         elif name in params:
             continue
-        if not isinstance(parameter, Parameter) or parameter.free:
+        size = hypothesis.usual(_measure_scale([data[experiment] for experiment in changed], params))
+        if not size or not isinstance(parameter, Parameter) or parameter.free:
             continue
         plants = plants | changed
         yield Addition(
@@ -317,21 +317,28 @@ def list_additions(problem: FitProblem, z: Vector) -> Iterator[Addition]:
         )
 
 
-def _measure_scale(experiments: Iterable[Experiment], params: ParameterSet) -> Scale:
-    """Return the stiffness of a spring, and the size of commands that are a pulse or a square wave: such logs are the
-    same whatever a motor makes of other currents.
+def _measure_scale(experiments: Sequence[Experiment], params: ParameterSet) -> Scale:
+    """Return the stiffness of the first spring, and the size of commands that are a pulse or a square wave, the same in
+    all logs: these are the same whatever a motor makes of other currents.
     """
-    stiffness, commands = 0.0, [np.zeros(1)]
+    stiffness, levels = 0.0, list[float]()
     for experiment in experiments:
         plant = experiment.plant
         if not stiffness and plant.spring is not None and plant.spring.stiffness:
             stiffness = plant.complete(experiment.apply_own(params))[plant.spring.stiffness].value
-        if plant.actuation is not None:
-            commands.append(np.abs(experiment.log.signals[plant.actuation.input].values))
-    sizes = np.concatenate(commands)
-    level = float(np.nanmax(sizes))
-    between = float(np.mean((sizes > LEVEL * level) & (sizes < (1.0 - LEVEL) * level)))
-    return Scale(stiffness=stiffness, level=level if between < BETWEEN else 0.0)
+        command = None if plant.actuation is None else experiment.log.signals.get(plant.actuation.input)
+        if command is not None and np.any(command.values):  # else it is zero throughout, which shows nothing
+            levels.append(_find_level(np.abs(command.values)))
+    same = bool(levels) and min(levels) > (1.0 - LEVEL) * max(levels)
+    return Scale(stiffness=stiffness, level=max(levels) if same else 0.0)
+
+
+def _find_level(sizes: VectorN) -> float:
+    """Return the one size that a log's commands have where they are not zero; 0 where they have several, or none."""
+    sizes = sizes[np.isfinite(sizes)]
+    level = float(np.quantile(sizes, LARGEST)) if sizes.size else 0.0
+    elsewhere = (sizes > LEVEL * level) & (np.abs(sizes - level) > LEVEL * level)
+    return level if np.mean(elsewhere) < BETWEEN else 0.0
 
 
 @memo

@@ -174,6 +174,40 @@ def test_a_motor_that_droops_is_said_to_touch_all_that_scales_where_commands_hav
     assert "where the motor's torque droops at large currents" in " ".join(repr(result).split())
 
 
+def name_silent(*currents):
+    """Return the effects that no log of such currents tells, of a fit without a torque."""
+    plant = so.plants.rotary(link="locked")
+    logs = [record(make_current=lambda t, make=make: make(t)) for make in currents]
+    logs = [so.Log.from_arrays(time=log.time, I=log["I"], theta_m=log["theta_m"]) for log in logs]
+    params = plant.defaults.update(**ROTARY).free("J_m", "b_r", "f_c", "k_s")
+    experiments = [so.Experiment(plant=plant, log=log, outputs=("theta_m",), initial_state="rest") for log in logs]
+    return {each.part for each in so.fit(experiments, params).silent}
+
+
+def test_a_second_size_of_the_commands_tells_a_droop_and_a_log_at_rest_does_not():
+    def switch(t, size):
+        return np.where(t * (1.0 + t) % 2.0 < 1.0, size, -size)
+
+    assert "droop" in name_silent(lambda t: switch(t, 2.5))
+    assert "droop" in name_silent(lambda t: switch(t, 2.5), np.zeros_like)
+    assert "droop" not in name_silent(lambda t: switch(t, 2.5), lambda t: switch(t, 1.2))
+
+
+def test_a_log_without_its_optional_current_has_no_size_of_it():
+    """An actuator that is shaken from outside, with its motor off."""
+    plant = so.plants.rotary("pendulum", external=True)
+    params = plant.defaults.update(f_c=0.0)
+    t, push = drive(4.0, RATE_HZ, 2.0, seed=3, top_hz=8.0)
+    log = so.Log.from_arrays(time=t, tau_e=push)
+    run, noise = so.simulate(plant, params, log), np.random.default_rng(4)
+    measured = {name: run[name] + noise.normal(scale=1e-4, size=t.size) for name in ("theta_m", "theta_l")}
+    log = so.Log.from_arrays(time=t, tau_e=push, **measured)
+    experiment = so.Experiment(plant=plant, log=log, outputs=tuple(measured), initial_state="rest")
+    result = so.fit([experiment], params.free("J_m", "J_l", "b_r"))
+    assert result.parameters["J_l"].value == pytest.approx(params["J_l"].value, rel=0.02)
+    assert "droop" not in {each.part for each in result.silent}
+
+
 def test_what_a_log_does_tell_is_not_named():
     log = record()
     assert [each.part for each in fit(log).silent] == ["stand", "back_driving"]
