@@ -262,8 +262,8 @@ def _excite(
         excitation = design_excitation(controller, share=share, **given)
         return excitation, _measure_swing(controller, runs, _scale(excitation, per_given)) if dry else None
 
-    def find_peaks(excitation: Excitation) -> dict[str, Peaks]:
-        return _find_peaks(controller, runs, _scale(excitation, per_given), kept, options["sensors"])
+    def find_peaks(excitation: Excitation, most: float) -> dict[str, Peaks]:
+        return _find_peaks(controller, runs, _scale(excitation, per_given), kept, options["sensors"], most)
 
     @cache  # runs of all draws, mostly asked for twice at the share that is played
     def predict(share: float) -> Prediction:
@@ -286,14 +286,15 @@ def _excite(
         if enough is not None and share < enough <= most:
             share = enough
             excitation, effort = play(share)
-    chosen = share
-    peaks = find_peaks(excitation)
+    chosen, room = share, math.inf if limit is None else ROOM * limit
     for _ in range(LOWERS):  # a period in which the command is at its limit is lost for the response
-        if limit is None or np.max(peaks[command]) < ROOM * limit:
+        peaks = find_peaks(excitation, room)
+        if limit is None or np.max(peaks[command]) < room:
             break
         share *= LESS
         excitation, effort = play(share)
-        peaks = find_peaks(excitation)
+    else:
+        peaks = find_peaks(excitation, math.inf)
     if endless := [name for name, seen in peaks.items() if not np.all(np.isfinite(seen))]:
         raise ControlError(
             f"{options.get('name', 'the law')}: {join_words(endless)} under its reference is not finite: the loop runs "
@@ -326,13 +327,14 @@ def _find_peaks(
     given: Excitation,
     draws: Sequence[Mapping[str, float]],
     sensors: Sensors | None,
+    most: float = math.inf,
 ) -> dict[str, Peaks]:
     """Return the peaks of the command, the plant's outputs and what is read under a reference, one for each run: by its
     lines where the machine is known, linear and read without error, else of the design plant and of draws, each with
     its own noise. With dry friction the lines tell nothing: they are those of a machine without it; and each runs with
     friction as its curve says, and with one that sticks, as a machine may be of either. A reading's noise is drawn anew
     for its own peak, which does not change how likely it is: white noise reaches the plant a sample later at the
-    earliest.
+    earliest. Once the command is not below the `most`, no further machine runs.
     """
     assert controller.design is not None
     plant, values = controller.design
@@ -362,9 +364,15 @@ def _find_peaks(
                 signals[name] = np.abs(signals[name] + std * rng.normal(size=signals[name].shape)) + 0.5 * step
             for name, rows in peaks.items():
                 rows += np.max(np.abs(signals[name]), axis=1).tolist()
+            if not max(peaks[controller.command.input]) < most:
+                break
         return peaks
 
-    ways = [run_all(sticks) for sticks in ((False, True) if dry and can_stick(seen) else (False,))]
+    ways = list[dict[str, list[float]]]()
+    for sticks in (False, True) if dry and can_stick(seen) else (False,):
+        ways.append(run_all(sticks))
+        if not max(ways[-1][controller.command.input]) < most:
+            return {name: np.array([peaks]) for name, peaks in ways[-1].items()}
     return {name: np.array([peaks[name] for peaks in ways]) for name in given.peaks}
 
 
