@@ -56,7 +56,21 @@ def sticking_step(plant: Plant) -> ca.Function:
     """Return the CasADi function (t, x, u, p, h) -> x+ of one step with friction that jumps, u held."""
     h = ca.SX.sym("h")
     after = sticking_line_step(plant)(plant.t, plant.x, plant.u, plant.u, plant.p, h)
-    return ca.Function("step", [*plant.symbols, h], [after])
+    return ca.Function("seaopt_step", [*plant.symbols, h], [ca.cse(after)])
+
+
+@memo
+def sliding_step(plant: Plant) -> ca.Function:
+    """Return the CasADi function (t, x, u, p, h) -> (x+, stops) of a step in which all joints slide on, as the first
+    part of `sticking_step`: where one stops, which `stops` tells, that step ends elsewhere.
+    """
+    joints, h = _Joints(plant), ca.SX.sym("h")
+    t, x, u, p = plant.symbols
+    signs = joints.signs(t, x, u, p)
+    end = runge_kutta_step(lambda t, x: joints.rate(t, x, u, p, joints.slide(x, u, p, signs)), t, x, h)
+    stops = ca.mmax(signs * joints.speeds(end, p) <= 0.0)
+    ends: Any = ca.cse([ca.densify(end), ca.densify(stops)])
+    return ca.Function("seaopt_slide", [*plant.symbols, h], ends)
 
 
 @memo
