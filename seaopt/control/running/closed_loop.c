@@ -1,12 +1,7 @@
 /* Sampled closed loops, sample by sample, one run after the other.
 
-   Built with constants and CasADi's functions in front (see seaopt/control/running/loop_kernel.py):
-   seaopt_sample: (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y), sensor, law and delay at one sample;
-   seaopt_step: (t, x, u, p, h) -> x+, one integration step; seaopt_observe: (t, x, u, p) -> y;
-   where friction sticks (STICKS) seaopt_slide: (t, x, u, p, h) -> (x+, stops), a step whose joints slide on, a fraction
-   of seaopt_step, which is needed where one stops. */
-#include <math.h>
-#include <string.h>
+   Built with constants, CasADi's functions and piece.h in front (see seaopt/control/running/loop_kernel.py);
+   seaopt_sample: (t, x, z, e, r, w, p, c, lag) -> (z+, u, late, y), sensor, law and delay at one sample. */
 
 typedef struct {
     long n, substeps, finest;  /* samples; steps of the coarse solution in a sample, the fine one takes twice as many;
@@ -20,37 +15,14 @@ typedef struct {
     double *y, *applied, *states; /* n x NY, n, n x NX */
 } seaopt_loop_args;
 
-/* `peak`: 0 where nobody asks for it. */
-static void piece(const seaopt_loop_args *a, double t, double lasting, const double *u, long steps, double *x, double *peak) {
-    double h = lasting / steps, next[NX], y[NY], work[SZ_W + 1];
-    const double *arg[SZ_ARG + 5];
-    double *res[SZ_RES + 2];
-    casadi_int iw[SZ_IW + 1];
-    for (long i = 0; i < steps; i++) {
-        double at = t + i * h, stops = 1.0;
-        arg[0] = &at; arg[1] = x; arg[2] = u; arg[3] = a->p; arg[4] = &h;
-        res[0] = next; res[1] = &stops;
-#if STICKS
-        seaopt_slide(arg, res, iw, work, 0);
-#endif
-        if (stops) seaopt_step(arg, res, iw, work, 0);
-        memcpy(x, next, sizeof next);
-        if (!peak) continue;
-        at += h;
-        res[0] = y;
-        seaopt_observe(arg, res, iw, work, 0);
-        for (int o = 0; o < NY; o++) peak[o] = fmax(peak[o], fabs(y[o]));
-    }
-}
-
 static void integrate(const seaopt_loop_args *a, double t, const double *u, const double *newer, long steps, double *x, double *peak) {
     if (a->late_s > 0.0) {
         double unmoved[NX];
-        piece(a, t, a->late_s, u, steps, x, peak);
+        piece(a->p, t, a->late_s, u, steps, x, peak);
         memcpy(unmoved, x, sizeof unmoved);
-        if (peak) piece(a, t + a->late_s, INSTANT * a->period, newer, 1, unmoved, peak); /* an output that the command reaches at once */
+        if (peak) piece(a->p, t + a->late_s, INSTANT * a->period, newer, 1, unmoved, peak); /* an output that the command reaches at once */
     }
-    piece(a, t + a->late_s, a->period - a->late_s, newer, steps, x, peak);
+    piece(a->p, t + a->late_s, a->period - a->late_s, newer, steps, x, peak);
 }
 
 static int agree(const seaopt_loop_args *a, const double *fine, const double *coarse) {

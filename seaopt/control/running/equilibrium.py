@@ -18,8 +18,8 @@ from jaxtyping import Float
 from seaopt.control.laws.realisation import Reading, RunnableLaw
 from seaopt.control.loops.compensation.terms import FORGOTTEN
 from seaopt.control.loops.sampled_plant import find_rest
+from seaopt.control.running.held import observe_function
 from seaopt.control.running.law_step import LawShape
-from seaopt.control.running.loop_kernel import observe_function
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop
 from seaopt.errors import ControlError
 from seaopt.plants import CompletedParameters, Plant

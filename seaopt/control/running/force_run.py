@@ -29,12 +29,11 @@ from seaopt.control.loops.sampled_plant import (
     whole_samples,
 )
 from seaopt.control.running.closed_loop import MAX_LOOP_SUBSTEPS, RTOL, STICKING_RTOL
-from seaopt.control.running.loop_kernel import MAX_EXPANDED_STEPS, advance_function, observe_function
+from seaopt.control.running.held import Hold, make_hold, observe_function
 from seaopt.control.running.sampled_loop import channel_names, largest_command
 from seaopt.errors import ControlError, RunawayError, StepSizeError, require_seed
 from seaopt.parameters import ParameterSet
 from seaopt.plants import CompletedParameters, Plant
-from seaopt.plants.memo import memo
 from seaopt.plants.plant import name_input
 from seaopt.plants.sensors.deflection import evaluate_weights
 from seaopt.records import record
@@ -193,7 +192,13 @@ def close_loop(
         raise ControlError(f"preview_samples = {preview_samples!r} is not a whole number of samples; give 0, 1, ...")
     newer, n, p = delay_samples + whole, reference.size, values.vector
     output, names = DirectCall(observe_function(plant, sticks)), channel_names(plant)
-    integrator = _Integrator(plant=plant, sticks=sticks, rtol=rtol or (STICKING_RTOL if sticks else RTOL), size=sizes)
+    integrator = _Integrator(
+        plant=plant,
+        hold=make_hold(plant, sticks),
+        sticks=sticks,
+        rtol=rtol or (STICKING_RTOL if sticks else RTOL),
+        size=sizes,
+    )
     idle = [0.0] * (len(plant.inputs) - 1)
     devices, signals = sensors or Sensors(), list_names(measured)
     rng = np.random.default_rng(require_seed(seed, ControlError))
@@ -293,21 +298,20 @@ class _Integrator:
     """A plant integrated while its inputs are held, in as many steps as it has needed so far."""
 
     plant: Plant
+    hold: Hold
     sticks: bool
     rtol: float
     substeps: int = FIRST_SUBSTEPS
     error: float = 0.0
     size: Any = 0.0
     peak: Any = 0.0  # largest magnitudes of the outputs
-    ends: DirectCall | None = None
 
     def advance(
         self, t: float, x: Float[np.ndarray, " nx"], u: list[float], p: Float[np.ndarray, " np"], lasting: float
     ) -> Any:
         """Return the state after a time `lasting`, the inputs held."""
         while True:
-            self.ends = self.ends or DirectCall(_ends(self.plant, self.substeps, self.sticks))
-            coarse, fine, peak = (end[:, 0] for end in self.ends(t, x, u, p, lasting))
+            coarse, fine, peak = self.hold(t, x, u, p, lasting, self.substeps)
             size = np.maximum(self.size, np.maximum(np.abs(x), np.abs(fine)))
             scale = np.maximum(size, STANDS * np.max(size))
             with np.errstate(invalid="ignore"):
@@ -318,7 +322,7 @@ class _Integrator:
                 return fine
             if 2 * self.substeps > MAX_LOOP_SUBSTEPS:
                 break
-            self.substeps, self.ends = 2 * self.substeps, None
+            self.substeps *= 2
         if not np.all(np.isfinite(fine)):
             raise RunawayError(f"the loop on {self.plant.name} runs away at t = {t:g} s; tune it again")
         raise StepSizeError(
@@ -326,22 +330,3 @@ class _Integrator:
             f"at t = {t:g} s (rtol = {self.rtol:g}); check the parameters and that the loop does not run away, smooth "
             "the friction (v_s), or raise rtol"
         )
-
-
-@memo
-def _ends(plant: Plant, substeps: int, sticks: bool) -> Any:
-    """Return the CasADi function (t, x, u, p, T) -> x after T in `substeps` steps and in twice as many, and the largest
-    outputs of these.
-    """
-    step = advance_function(plant, sticks)
-    t, x, u, p, lasting = (
-        ca.MX.sym(name, size) for name, size in zip("txupT", map(step.numel_in, (0, 1, 3, 4, 5)), strict=True)
-    )
-    ends, top = list[Any](), None
-    for count in (substeps, 2 * substeps):
-        at, top, h = x, ca.MX.zeros(step.numel_in(2)), lasting / count
-        for i in range(count):
-            at, top = step(t + i * h, at, top, u, p, h)
-        ends.append(ca.densify(at))
-    whole = ca.Function("held", [t, x, u, p, lasting], [*ends, ca.densify(top)])
-    return whole.expand() if substeps <= MAX_EXPANDED_STEPS else whole

@@ -1,7 +1,6 @@
 """Kernels of sampled loops, for `closed_loop`: two CasADi functions, run compiled or by CasADi's virtual machine.
 
-`seaopt_sample` is sensor, law and delay at one sample; `seaopt_step` is one step of the plant. Where friction sticks
-`seaopt_slide` is a step without a stop, and most steps need no other.
+`seaopt_sample` is sensor, law and delay at one sample; between samples the plant's inputs are held (`held`).
 Parameters and the law's matrices are data, so that one compilation serves every draw and every controller of a
 structure. The two ways give the same numbers to rounding, of which a quantiser can make a step.
 """
@@ -12,7 +11,6 @@ import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
-from importlib.resources import files
 from typing import Any
 
 import casadi as ca
@@ -21,6 +19,13 @@ from jaxtyping import Float
 
 from seaopt.bench import Sensors
 from seaopt.control.laws.plausibility import LARGEST
+from seaopt.control.running.held import (
+    MAX_EXPANDED_STEPS,
+    advance_function,
+    observe_function,
+    plant_source,
+    read_code,
+)
 from seaopt.control.running.law_step import LawShape, express_step, list_numbers
 from seaopt.control.running.sampled_loop import LoopState, SampledLoop, channel_names
 from seaopt.errors import SimulationError, require_memory
@@ -28,13 +33,10 @@ from seaopt.plants import Plant
 from seaopt.plants.memo import memo
 from seaopt.plants.sensors.deflection import weigh_encoders
 from seaopt.records import record
-from seaopt.simulation.native import Kernel, define_constants, generate_code, load_kernel, row_addresses
-from seaopt.simulation.runge_kutta import runge_kutta_step
-from seaopt.simulation.sticking import sliding_step, sticking_output, sticking_step
+from seaopt.simulation.native import Kernel, define_constants, load_kernel, row_addresses
 
 INSTANT = 1e-9  # of a sample: after it an output shows what the command does at once
 CHAINED_SAMPLES = 250  # samples that the virtual machine chains in one call
-MAX_EXPANDED_STEPS = 8  # coarse steps per sample up to which its operations are one flat list there
 Rows = Float[np.ndarray, "runs n"]
 
 
@@ -195,37 +197,6 @@ def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
 
 
 @memo
-def observe_function(plant: Plant, sticks: bool) -> Any:
-    """Return the CasADi function (t, x, u, p) -> outputs, and the energy where the plant declares it."""
-    output = sticking_output(plant)(plant.t, plant.x, plant.u, plant.p) if sticks else plant.output
-    rows = [output] + ([plant.stored_energy()] if plant.energy is not None else [])
-    return ca.Function("seaopt_observe", [plant.t, plant.x, plant.u, plant.p], [ca.densify(ca.vertcat(*rows))])
-
-
-def runge_kutta(plant: Plant) -> Any:
-    """Return the CasADi function (t, x, u, p, h) -> x+: a step of Runge's and Kutta's fourth order, u held."""
-    rate = ca.Function("rate", [plant.t, plant.x, plant.u, plant.p], [plant.dynamics])
-    t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
-    after = runge_kutta_step(lambda t, x: rate(t, x, u, p), t, x, h)
-    return ca.Function("seaopt_step", [t, x, u, p, h], [ca.cse(ca.densify(after))])
-
-
-def step_function(plant: Plant, sticks: bool) -> Any:
-    """Return the CasADi function (t, x, u, p, h) -> x+: one integration step, u held."""
-    return sticking_step(plant) if sticks else runge_kutta(plant)
-
-
-@memo
-def advance_function(plant: Plant, sticks: bool) -> Any:
-    """Return the CasADi function (t, x, peak, u, p, h) -> (x+, peak+): one integration step, and the largest |y|."""
-    t, x, u, p, h = plant.t, plant.x, plant.u, plant.p, ca.SX.sym("h")
-    peak = ca.SX.sym("peak", len(channel_names(plant)))
-    after = step_function(plant, sticks)(t, x, u, p, h)
-    top = ca.fmax(peak, ca.fabs(observe_function(plant, sticks)(t + h, after, u, p)))
-    return ca.Function("seaopt_advance", [t, x, peak, u, p, h], ca.cse([after, ca.densify(top)]))
-
-
-@memo
 def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Any, Kernel | None]:
     """Return the functions of one sample and of one step, and their library where there is a compiler."""
     sample, advance = _sample_function(plant, structure), advance_function(plant, structure.sticks)
@@ -241,16 +212,11 @@ def make_kernel(loop: SampledLoop, job: Job) -> Callable[[Job, Steps], LoopArray
 
 
 def _source(plant: Plant, structure: _Structure, sample: ca.Function) -> str:
-    sticks = structure.sticks
-    functions = [sample, step_function(plant, sticks), observe_function(plant, sticks)]
-    functions += [sliding_step(plant)] if sticks else []
     constants = {
-        "NX": len(plant.states), "NU": len(plant.inputs), "NE": len(plant.inputs) - 1, "NW": structure.columns,
-        "NY": len(channel_names(plant)), "NZ": structure.law.kept + structure.waiting,
-        "INSTANT": INSTANT, "STICKS": int(sticks),
+        "NU": len(plant.inputs), "NE": len(plant.inputs) - 1, "NW": structure.columns,
+        "NZ": structure.law.kept + structure.waiting, "INSTANT": INSTANT,
     }  # fmt: skip
-    template = files("seaopt.control.running").joinpath("closed_loop.c").read_text(encoding="utf-8")
-    return "\n".join((define_constants(constants), generate_code(*functions), template))
+    return define_constants(constants) + plant_source(plant, structure.sticks, sample) + read_code("closed_loop.c")
 
 
 def _allocate(loop: SampledLoop, job: Job) -> LoopArrays:
