@@ -1,4 +1,4 @@
-r"""Steps of a plant with one joint that sticks, from event to event, in Python: those of pass.c, for no compiler.
+r"""Steps of a plant with one joint that sticks, from event to event, in Python: those of step.c, for no compiler.
 
 Between events the plant is smooth. The joint slides in a direction, m = 1 or -1, under the force :math:`m F(|v|)`, or
 is held, m = 0, by the force :math:`\lambda` that leaves it no acceleration; each stretch is one step of Runge's and
@@ -30,7 +30,7 @@ from jaxtyping import Float
 from seaopt.records import record
 from seaopt.simulation.direct_call import DirectCall
 
-PHASES = 8  # of a step; these constants are those of pass.c
+PHASES = 8  # of a step; these constants are those of step.c
 STILL_S = 1e-13  # a velocity that friction alone takes away in this time is rounding
 ROUNDS = 8  # of Newton's method on the cubic
 

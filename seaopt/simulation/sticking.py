@@ -6,7 +6,7 @@ A friction whose role declares its `jump` F is here the set-valued
 
 in place of its smoothed curve.
 
-Of a plant with one such joint, log passes step from event to event (`seaopt.simulation.events`, `pass.c`), between
+Of a plant with one such joint, log passes step from event to event (`seaopt.simulation.events`, `step.c`), between
 which the plant is smooth: the joint slides in the direction m = 1 or -1, or is held, m = 0, by the force that leaves it
 no acceleration. `joint_equations` are its equations.
 

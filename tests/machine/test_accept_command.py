@@ -418,7 +418,7 @@ def test_a_fault_is_named_and_the_exit_code_is_one(folder, accept):
         (Machine(delay_s=1e-3), r"next: look for [\d.]+ ms in the firmware.*: drive_delay_s = ([\d.]+) seaopt tune"),
         (
             Machine(mass=1.5 * Machine().mass),
-            r"next: if the machine is so, with J free put .*: seaopt fit .* seaopt t",
+            r"next: if the machine is so, put .*, fit these logs too, with J free, and tune.*: seaopt fit .* seaopt t",
         ),
     ],
 )

@@ -162,7 +162,10 @@ def test_a_stage_that_is_lowered_for_the_peak_of_its_command_says_that_this_limi
     assert stage.lowered and "Ms" in stage.broken and measure_sensitivity(bench, machine, stage.excitation) > 2.1
     larger = design_excitation(law, share=stage.enough, bias=0.0, phases=6, periods=3, limits={}, seed=1)
     assert measure_sensitivity(bench, machine, larger) < 2.1
-    log = Bench(compiler, tmp_path, law).log(machine, larger.reference, noise=NOISE)
+    limited, played = Bench(compiler, tmp_path, law), stage.excitation
+    log = limited.log(machine, larger.reference, noise=NOISE)
     assert np.max(np.abs(log["I"])) > 0.95 * 0.6
+    logs = [limited.log(machine, played.reference, noise=NOISE, seed=seed) for seed in range(6)]
+    assert 0.8 < max(np.max(np.abs(each["tau_s"])) for each in logs) / played.peaks["tau_s"] <= 1.0
     said = say_prediction(stage)[-1]
     assert f"At a share of {stage.enough:.2g}" in said and "the limit of the command stands in the way" in said

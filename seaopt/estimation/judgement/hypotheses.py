@@ -36,7 +36,7 @@ from seaopt.simulation import simulate
 
 FASTEST = 2.0  # of the rate of a log: a pole beyond it does nothing that the log shows, and takes ever shorter steps
 LARGEST = 0.999  # quantile of a size over a log: what it has at its largest, but for rounding
-LEVEL = 0.05  # of the largest command: what is so near to it, or to zero, is there
+LEVEL = 0.05  # of a size that commands have: what is so near to it, or to zero, is there
 BETWEEN = 0.02  # of the samples that may be elsewhere
 SIMULATED = 1e-2  # of a signal: error of the simulation that tells sizes
 
@@ -321,24 +321,22 @@ def _measure_scale(experiments: Sequence[Experiment], params: ParameterSet) -> S
     """Return the stiffness of the first spring, and the size of commands that are a pulse or a square wave, the same in
     all logs: these are the same whatever a motor makes of other currents.
     """
-    stiffness, levels = 0.0, list[float]()
+    stiffness, commands = 0.0, list[VectorN]()
     for experiment in experiments:
         plant = experiment.plant
         if not stiffness and plant.spring is not None and plant.spring.stiffness:
             stiffness = plant.complete(experiment.apply_own(params))[plant.spring.stiffness].value
         command = None if plant.actuation is None else experiment.log.signals.get(plant.actuation.input)
-        if command is not None and np.any(command.values):  # else it is zero throughout, which shows nothing
-            levels.append(_find_level(np.abs(command.values)))
-    same = bool(levels) and min(levels) > (1.0 - LEVEL) * max(levels)
-    return Scale(stiffness=stiffness, level=max(levels) if same else 0.0)
+        if command is not None:  # else it is zero throughout
+            commands.append(np.abs(command.values))
+    return Scale(stiffness=stiffness, level=_find_level(np.concatenate(commands)) if commands else 0.0)
 
 
 def _find_level(sizes: VectorN) -> float:
-    """Return the one size that a log's commands have where they are not zero; 0 where they have several, or none."""
-    sizes = sizes[np.isfinite(sizes)]
-    level = float(np.quantile(sizes, LARGEST)) if sizes.size else 0.0
-    elsewhere = (sizes > LEVEL * level) & (np.abs(sizes - level) > LEVEL * level)
-    return level if np.mean(elsewhere) < BETWEEN else 0.0
+    """Return the one size that commands have where they are not zero, but for a few; 0 where they have several."""
+    used = sizes[sizes > LEVEL * np.quantile(sizes, 1.0 - BETWEEN)] if sizes.size else sizes  # the largest are spikes
+    level = float(np.median(used)) if used.size else 0.0
+    return level if np.sum(np.abs(used - level) > LEVEL * level) < BETWEEN * sizes.size else 0.0
 
 
 @memo

@@ -262,7 +262,7 @@ def _excite(
         excitation = design_excitation(controller, share=share, **given)
         return excitation, _measure_swing(controller, runs, _scale(excitation, per_given)) if dry else None
 
-    def find_peaks(excitation: Excitation, most: float) -> dict[str, Peaks]:
+    def find_peaks(excitation: Excitation, most: float | None) -> dict[str, Peaks]:
         return _find_peaks(controller, runs, _scale(excitation, per_given), kept, options["sensors"], most)
 
     @cache  # runs of all draws, mostly asked for twice at the share that is played
@@ -286,15 +286,15 @@ def _excite(
         if enough is not None and share < enough <= most:
             share = enough
             excitation, effort = play(share)
-    chosen, room = share, math.inf if limit is None else ROOM * limit
+    chosen, room = share, None if limit is None else ROOM * limit
     for _ in range(LOWERS):  # a period in which the command is at its limit is lost for the response
         peaks = find_peaks(excitation, room)
-        if limit is None or np.max(peaks[command]) < room:
+        if room is None or np.max(peaks[command]) < room:
             break
         share *= LESS
         excitation, effort = play(share)
     else:
-        peaks = find_peaks(excitation, math.inf)
+        peaks = find_peaks(excitation, None)
     if endless := [name for name, seen in peaks.items() if not np.all(np.isfinite(seen))]:
         raise ControlError(
             f"{options.get('name', 'the law')}: {join_words(endless)} under its reference is not finite: the loop runs "
@@ -327,7 +327,7 @@ def _find_peaks(
     given: Excitation,
     draws: Sequence[Mapping[str, float]],
     sensors: Sensors | None,
-    most: float = math.inf,
+    most: float | None = None,
 ) -> dict[str, Peaks]:
     """Return the peaks of the command, the plant's outputs and what is read under a reference, one for each run: by its
     lines where the machine is known, linear and read without error, else of the design plant and of draws, each with
@@ -352,6 +352,9 @@ def _find_peaks(
     errors = {name: noise.combine_errors(seen, completed, name) for name in controller.signals if name in given.peaks}
     groups = math.ceil(0.5 * len(sets)) if noisy else 1  # two runs share their noise, with both signs
 
+    def reaches(peaks: Mapping[str, Sequence[float]]) -> bool:
+        return most is not None and not np.max(peaks[controller.command.input]) < most  # which NaN is not
+
     def run_all(sticks: bool) -> dict[str, list[float]]:
         peaks: dict[str, list[float]] = {name: [] for name in given.peaks}
         for seed in range(groups):
@@ -364,14 +367,14 @@ def _find_peaks(
                 signals[name] = np.abs(signals[name] + std * rng.normal(size=signals[name].shape)) + 0.5 * step
             for name, rows in peaks.items():
                 rows += np.max(np.abs(signals[name]), axis=1).tolist()
-            if not max(peaks[controller.command.input]) < most:
+            if reaches(peaks):
                 break
         return peaks
 
     ways = list[dict[str, list[float]]]()
     for sticks in (False, True) if dry and can_stick(seen) else (False,):
         ways.append(run_all(sticks))
-        if not max(ways[-1][controller.command.input]) < most:
+        if reaches(ways[-1]):
             return {name: np.array([peaks]) for name, peaks in ways[-1].items()}
     return {name: np.array([peaks[name] for peaks in ways]) for name in given.peaks}
 

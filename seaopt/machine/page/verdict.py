@@ -48,7 +48,7 @@ LATER = (
     "line of that name, and tune again:"
 )
 ANOTHER = (
-    "if the machine is so, {}put the tables of again/*.toml into the problem file, fit these logs too, and tune again:"
+    "if the machine is so, put the tables of again/*.toml into the problem file, fit these logs too{}, and tune again:"
 )
 NO_MODEL = "the machine was compared with no model, since the law was designed on none"
 UNCERTIFIED = {
@@ -124,7 +124,7 @@ def _list_remedies(result: Acceptance, commands: Commands) -> list[Step]:
             lines = (f"drive_delay_s = {format_number(late)}", commands.tune)
             steps.append(Step(text=LATER.format(f"{1e3 * each.value:.3g}"), copied=lines))
         if each.kind in ("parameter", "gain") and each.value > 0.0 and result.experiments:
-            free = f"with {each.name} free " if each.kind == "parameter" else ""
+            free = f", with {each.name} free" if each.kind == "parameter" else ""
             steps.append(Step(text=ANOTHER.format(free), copied=(commands.fit, commands.tune)))
     return steps
 

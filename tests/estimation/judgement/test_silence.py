@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import seaopt as so
+from seaopt.estimation.judgement.hypotheses import _find_level
 from tests.actuator_logs import drive, integrate
 
 RATE_HZ = 400.0
@@ -191,6 +192,19 @@ def test_a_second_size_of_the_commands_tells_a_droop_and_a_log_at_rest_does_not(
     assert "droop" in name_silent(lambda t: switch(t, 2.5))
     assert "droop" in name_silent(lambda t: switch(t, 2.5), np.zeros_like)
     assert "droop" not in name_silent(lambda t: switch(t, 2.5), lambda t: switch(t, 1.2))
+
+
+@pytest.mark.parametrize("rows", [500, 5000])
+@pytest.mark.parametrize(("spikes", "spike"), [(0, 0.0), (1, 5.0), (6, 5.0), (1, 200.0), (6, 60.0)])
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_size_is_found_beside_spikes_and_noise(rows, spikes, spike, noise):
+    wave = np.where(np.arange(rows) % 100 < 50, 2.5, 0.0)
+    sizes = np.abs(wave + noise * np.random.default_rng(1).normal(size=rows))
+    sizes[:: rows // 6][:spikes] = spike
+    assert _find_level(sizes) == pytest.approx(2.5, rel=0.02)
+    assert _find_level(np.abs(2.5 * np.sin(np.arange(rows)))) == 0.0
+    assert _find_level(np.concatenate([sizes, 0.5 * sizes])) == 0.0
+    assert _find_level(np.zeros(rows)) == _find_level(np.zeros(0)) == 0.0
 
 
 def test_a_log_without_its_optional_current_has_no_size_of_it():
