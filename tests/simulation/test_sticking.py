@@ -14,7 +14,7 @@ from seaopt.control.laws.realisation import runnable
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
 from seaopt.errors import SimulationError
 from seaopt.plants.roles import Friction
-from seaopt.simulation.sticking import sticking_output, sticking_step
+from seaopt.simulation.sticking import sliding_step, sticking_output, sticking_step
 from tests.stick_slip import Mass, simulate
 
 M, K = 2.0, 800.0  # kg, N/m
@@ -89,6 +89,27 @@ def test_stick_slip_is_that_of_an_integrator_with_events(block):
         assert states[after, 0] == pytest.approx(place, rel=2e-3)
         assert abs(states[after, 1]) < 1e-15
         assert abs(states[round((begin - 5e-3) / 2e-4), 1]) < 1e-15 and states[round((begin + 0.03) / 2e-4), 1] > 1e-4
+
+
+def test_a_step_that_slides_on_is_the_whole_step_where_nothing_stops(block):
+    """A stop is told by the block's speed, by scipy: it turns within the step."""
+    values, rng, told = [M, K, LEVEL, HELD], np.random.default_rng(3), [0, 0]
+    whole, slide = sticking_step(block), sliding_step(block)
+    for _ in range(600):
+        x, effort, h = [0.01 * rng.normal(), 0.02 * rng.normal()], [10.0 * rng.normal()], 5e-4
+        after, stops = slide(0.0, x, effort, values, h)
+        sign = np.sign(x[1])
+        level = lambda v: LEVEL + (HELD - LEVEL) * np.exp(-((v / FALL) ** 2))  # noqa: E731
+        run = solve_ivp(
+            lambda _, z, u=effort[0], s=sign, level=level: [z[1], (u - K * z[0] - s * level(max(s * z[1], 0.0))) / M],
+            (0.0, h), x, rtol=1e-10, atol=1e-14,
+        )  # fmt: skip
+        assert bool(stops) == (sign * run.y[1, -1] <= 0.0)
+        told[bool(stops)] += 1
+        if not stops:
+            np.testing.assert_allclose(np.array(after), np.array(whole(0.0, x, effort, values, h)), rtol=1e-13)
+            np.testing.assert_allclose(np.array(after)[:, 0], run.y[:, -1], rtol=1e-5, atol=1e-7)
+    assert min(told) > 20
 
 
 def test_what_stands_still_is_held_by_the_force_that_keeps_it_so(block):

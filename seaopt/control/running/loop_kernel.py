@@ -1,4 +1,4 @@
-"""Kernels of sampled loops, for `closed_loop`: two CasADi functions, run compiled or by CasADi's virtual machine.
+"""Kernels of sampled loops, for `closed_loop`: CasADi functions, run compiled or by CasADi's virtual machine.
 
 `seaopt_sample` is sensor, law and delay at one sample; between samples the plant's inputs are held (`held`).
 Parameters and the law's matrices are data, so that one compilation serves every draw and every controller of a
@@ -197,15 +197,15 @@ def _constants(loop: SampledLoop) -> Float[np.ndarray, " m"]:
 
 
 @memo
-def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Any, Kernel | None]:
-    """Return the functions of one sample and of one step, and their library where there is a compiler."""
-    sample, advance = _sample_function(plant, structure), advance_function(plant, structure.sticks)
-    return sample, advance, load_kernel(_source(plant, structure, sample), "seaopt_loops")
+def _kernel(plant: Plant, structure: _Structure) -> tuple[Any, Kernel | None]:
+    """Return the function of one sample, and the library of a loop where there is a compiler."""
+    sample = _sample_function(plant, structure)
+    return sample, load_kernel(_source(plant, structure, sample), "seaopt_loops")
 
 
 def make_kernel(loop: SampledLoop, job: Job) -> Callable[[Job, Steps], LoopArrays]:
     """Return what runs a job: compiled code or, without a compiler, CasADi's virtual machine."""
-    native, constants = _kernel(loop.plant, _structure_of(loop, job))[2], _constants(loop)
+    native, constants = _kernel(loop.plant, _structure_of(loop, job))[1], _constants(loop)
     if native is None:
         return partial(_run_interpreted, loop, constants)
     return partial(_run_compiled, loop, constants, native)
@@ -267,7 +267,7 @@ def _run_compiled(loop: SampledLoop, c: Float[np.ndarray, " m"], native: Kernel,
 
 
 def _run_interpreted(loop: SampledLoop, c: Float[np.ndarray, " m"], job: Job, steps: Steps) -> LoopArrays:
-    """Run in CasADi's virtual machine: the same two functions, chained in a third."""
+    """Run in CasADi's virtual machine: its functions of a sample and of a step, chained in another."""
     arrays = _allocate(loop, job)
     runs, n = job.reference.shape
     chunk = min(n, CHAINED_SAMPLES)
@@ -308,7 +308,7 @@ def _period_function(
     """Return ([x, z, peak, error, size], t, e, r, w, p, c, lag, late_s, most) -> (the same a sample later, y, current,
     x).
     """
-    sample, _, _ = _kernel(plant, structure)
+    sample, _ = _kernel(plant, structure)
     sizes = [len(plant.states), structure.law.kept + structure.waiting, len(channel_names(plant))]
     state = ca.MX.sym("state", sizes[0] * 3 + sizes[1] + sizes[2])
     t, r, late_s = (ca.MX.sym(name) for name in ("t", "r", "late_s"))
@@ -332,7 +332,7 @@ def _period_function(
 
 def _between_samples(plant: Plant, structure: _Structure, sample_time_s: float, steps: int, *, split: bool) -> Any:
     """Return the CasADi function (x, peak, u, newer, t, late_s, p) -> (x+, peak+): a sample in so many steps."""
-    advance = _kernel(plant, structure)[1]
+    advance = advance_function(plant, structure.sticks)
     x, peak, u, p = (ca.MX.sym(name, advance.numel_in(i)) for name, i in (("x", 1), ("peak", 2), ("u", 3), ("p", 4)))
     newer, t, late_s = ca.MX.sym("newer", u.numel()), ca.MX.sym("t"), ca.MX.sym("late_s")
     pieces = [(u, t, late_s), (newer, t + late_s, sample_time_s - late_s)] if split else [(newer, t, sample_time_s)]

@@ -321,19 +321,21 @@ def _measure_scale(experiments: Sequence[Experiment], params: ParameterSet) -> S
     """Return the stiffness of the first spring, and the size of commands that are a pulse or a square wave, the same in
     all logs: these are the same whatever a motor makes of other currents.
     """
-    stiffness, commands = 0.0, list[VectorN]()
+    stiffness, levels = 0.0, list[float]()
     for experiment in experiments:
         plant = experiment.plant
         if not stiffness and plant.spring is not None and plant.spring.stiffness:
             stiffness = plant.complete(experiment.apply_own(params))[plant.spring.stiffness].value
         command = None if plant.actuation is None else experiment.log.signals.get(plant.actuation.input)
-        if command is not None:  # else it is zero throughout
-            commands.append(np.abs(command.values))
-    return Scale(stiffness=stiffness, level=_find_level(np.concatenate(commands)) if commands else 0.0)
+        if command is not None and np.any(command.values):  # else it is zero throughout, which shows nothing
+            levels.append(_find_level(np.abs(command.values)))
+    same = bool(levels) and min(levels) > (1.0 - LEVEL) * max(levels)
+    return Scale(stiffness=stiffness, level=max(levels) if same else 0.0)
 
 
 def _find_level(sizes: VectorN) -> float:
-    """Return the one size that commands have where they are not zero, but for a few; 0 where they have several."""
+    """Return the one size that a log's commands have where they are not zero, but for a few; 0 if they have several."""
+    sizes = sizes[np.isfinite(sizes)]
     used = sizes[sizes > LEVEL * np.quantile(sizes, 1.0 - BETWEEN)] if sizes.size else sizes  # the largest are spikes
     level = float(np.median(used)) if used.size else 0.0
     return level if np.sum(np.abs(used - level) > LEVEL * level) < BETWEEN * sizes.size else 0.0

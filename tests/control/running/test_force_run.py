@@ -8,7 +8,9 @@ from scipy.integrate import solve_ivp
 
 import seaopt as so
 from seaopt.control import close_loop
+from seaopt.control.running import held
 from seaopt.control.running.closed_loop import SampledLoop, run_loop
+from seaopt.control.running.held import make_hold
 from seaopt.errors import ControlError, RunawayError, SimulationError
 from tests.control.running.test_closed_loop import delayed, law, swing_by_hand
 
@@ -36,6 +38,19 @@ def test_the_plant_is_dop853s_however_sharp_its_friction(swing, thor, friction, 
     np.testing.assert_allclose(run.state[:, 2], np.array(states)[:, 2], atol=1e-5)
     assert run.error <= 1e-6
     assert run.substeps == 4 if not friction else run.substeps > 4
+
+
+@pytest.mark.parametrize("sticks", [False, True])
+def test_compiled_and_interpreted_hold_a_plant_alike(stand, thor, sticks):
+    """From rest, where it sticks, and where it slides and stops, in two and in eight steps."""
+    values, rng = stand.complete(thor.update(f_c=20.0)).vector, np.random.default_rng(1)
+    ways = [make_hold(stand, sticks), held._hold_interpreted(stand, sticks)]
+    for steps in (2, 8):
+        for speed in (0.0, 1e-3, 0.05):
+            x, u = np.array([1e-4, speed]) * rng.normal(size=2), [2.0 * rng.normal()]
+            compiled, interpreted = (hold(0.0, x, u, values, 1e-3, steps) for hold in ways)
+            for one, other in zip(compiled, interpreted, strict=True):
+                np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-16)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.7e-3, 2.3e-3])

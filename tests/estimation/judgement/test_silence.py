@@ -202,6 +202,7 @@ def test_a_size_is_found_beside_spikes_and_noise(rows, spikes, spike, noise):
     sizes = np.abs(wave + noise * np.random.default_rng(1).normal(size=rows))
     sizes[:: rows // 6][:spikes] = spike
     assert _find_level(sizes) == pytest.approx(2.5, rel=0.02)
+    assert _find_level(np.append(sizes, np.nan)) == pytest.approx(2.5, rel=0.02)
     assert _find_level(np.abs(2.5 * np.sin(np.arange(rows)))) == 0.0
     assert _find_level(np.concatenate([sizes, 0.5 * sizes])) == 0.0
     assert _find_level(np.zeros(rows)) == _find_level(np.zeros(0)) == 0.0
